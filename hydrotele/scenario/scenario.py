@@ -1,5 +1,6 @@
-"""Scenario of one run: machine, start, pilot, controller, sensors and clocks.
+"""Scenario of one run: machine, start, pilot, controller, sensors, and control and log rates.
 
+The pilot is the source of the motion: given commands, a reference path, or a person at a joystick.
 Scenarios are read from YAML files, validated and frozen; `scenarios/` holds the shipped ones. Keys
 may have units as suffixes, as in machine files.
 """
@@ -31,7 +32,7 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 
 
 class Plate(StrictModel):
-    """A plate on a spring and a damper: an environment of known stiffness.
+    """A plate on a spring and a damper that the tool can press: an environment of known stiffness.
 
     `position` [m] is the centre of its face and `normal` the outward normal of the face (z is up,
     -x points back to the machine). `size` holds the half sizes [m]; further keys are mass [kg],
@@ -109,7 +110,8 @@ class LogOnGround(StrictModel):
 class SoilGround(StrictModel):
     """Ground that the bucket of the machine can dig up: a strip of soil in the plane of the arm.
 
-    `soil` names one of the soils of `soil.facts`. Other links of the machine touch firm ground.
+    `soil` selects the soil's strength parameters by name. Other links of the machine touch firm
+    ground.
     """
 
     kind: Literal["soil"] = "soil"
@@ -120,7 +122,11 @@ SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround, F
 
 
 class Pose(StrictModel):
-    """Pose of the tip: r from the swing axis, z above ground [m], theta, attitude, head [rad]."""
+    """Pose of the arm's tip in cylindrical coordinates about the swing axis.
+
+    `r` is the distance from the axis and `z` the height above ground [m]. `theta` is the swing angle,
+    `attitude` the pitch of the tool and `head` its rotation [rad]; not all arms have the last two.
+    """
 
     r: PositiveFloat
     z: float
@@ -130,14 +136,17 @@ class Pose(StrictModel):
 
 
 class StartState(StrictModel):
-    """Start of a run: joint positions [rad] or [m], or a tip pose; the home position by default."""
+    """Start of a run: joint positions by joint name [rad] or [m], or a tip pose.
+
+    Joints that are not given start at the machine's home position.
+    """
 
     joints: dict[Name, float] = {}
     pose: Pose | None = None
 
 
 class ConstantPilot(StrictModel):
-    """Constant drive commands, open loop."""
+    """Constant commands to valves or drives, open loop: axis -> command [1] or [V]."""
 
     kind: Literal["constant"]
     commands: dict[Name, float] = {}
@@ -148,7 +157,8 @@ class TablePilot(StrictModel):
 
     `quantity: command` drives the valves open loop, `quantity: joint` gives joint references [rad]
     or [m]. `file` is a CSV or Parquet log, of which the columns `command.<axis>` or
-    `reference.<axis>` (otherwise `angle.<axis>`, `position.<axis>`) are used.
+    `reference.<axis>` (otherwise `angle.<axis>`, `position.<axis>`) are used. `interpolate` holds
+    the last value or connects the values linearly.
     """
 
     renamed = {"of": "quantity"}
@@ -182,7 +192,10 @@ def _check_capacity(name: str, amount: float) -> None:
 
 
 class FourierSeries(StrictModel):
-    """Fourier reference of one joint: mean + sum_k sin_k sin(k w t) + cos_k cos(k w t)."""
+    """Fourier series of one joint's reference: `mean + sum_k (sin_k sin(k w t) + cos_k cos(k w t))`.
+
+    k counts from 1, w is 2 pi over the common period, and all coefficients are in [rad] or [m].
+    """
 
     mean: float = 0.0
     sin: list[float] = []
@@ -190,7 +203,9 @@ class FourierSeries(StrictModel):
 
 
 class FourierPilot(StrictModel):
-    """Fourier references with a common period [s], faded in from the start over `fade` [s].
+    """Periodic joint references as Fourier series with a common `period` [s].
+
+    They are faded in from the start position over `fade` [s].
 
     The servo holds axes without a reference at their start, except those in `closed_valves`, whose
     command is always 0.
@@ -212,7 +227,10 @@ class FourierPilot(StrictModel):
 
 
 class TipMove(StrictModel):
-    """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad]."""
+    """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad].
+
+    `speed` is that of the tip [m/s], or [rad/s] if only angles change; `pause` [s] follows the move.
+    """
 
     r: float = 0.0
     z: float = 0.0
@@ -224,11 +242,11 @@ class TipMove(StrictModel):
 
 
 class LinesPilot(StrictModel):
-    """Straight tip lines by resolved motion in cylindrical coordinates.
+    """Straight moves of the tip in cylindrical coordinates, converted to joint references.
 
     `mode: rate` integrates rate commands like those of a joystick under rate control; `position`
-    commands the pose. The speed is that of the tip [m/s] (or [rad/s] if only angles change),
-    reached with `acceleration`.
+    commands the pose. The tip rests for `settle` [s] and then makes the `moves`, whose speeds are
+    reached with `acceleration` [m/s^2] or [rad/s^2].
     """
 
     kind: Literal["lines"]
@@ -244,7 +262,10 @@ class LinesPilot(StrictModel):
 
 
 class Waypoint(StrictModel):
-    """Joint target or pose, reached `duration` [s] after the previous one and held for `pause`."""
+    """Joint positions or tip pose, reached `duration` [s] after the previous one, held `pause` [s].
+
+    `joints` are joint name -> position [rad] or [m].
+    """
 
     duration: PositiveFloat
     pause: NonNegativeFloat = 0.0
@@ -253,7 +274,10 @@ class Waypoint(StrictModel):
 
 
 class WaypointsPilot(StrictModel):
-    """Waypoints connected by quintic polynomials, in joint space or along the tip pose."""
+    """Waypoints connected by quintic polynomials of time, in joint space or in the tip pose.
+
+    The motion starts after `settle` [s].
+    """
 
     kind: Literal["waypoints"]
     settle: NonNegativeFloat = 0.5
@@ -272,11 +296,12 @@ Pilot = Annotated[
 
 
 class Servo(StrictModel):
-    """Gains of the joint servo.
+    """Settings of the servo that moves every joint along its reference.
 
-    `position_gain` [1/s]; `axis_gains` [1/s] for individual axes (such as a slewing house);
-    `velocity_gain` (force drives only) [N s/m] or [N m s/rad]; `feedforward` and
-    `deadband_compensation` as fractions; `lead` [s], a phase lead that compensates the spool lag;
+    `position_gain` [1/s] is the velocity command per position error; `axis_gains` [1/s] replace it for
+    individual axes (such as a slewing house); `velocity_gain` (force drives only) [N s/m] or
+    [N m s/rad]; `feedforward` of the reference velocity and `deadband_compensation` of the valves, as
+    fractions; `lead` [s], a phase lead that compensates the spool lag;
     `pressure_feedback` [1/s], which adds damping, with the time constant `load_time` [s] of the
     low-pass filtered drive force. `force_model` replaces the filtered force by inverse dynamics
     along the reference, of the machine of the scenario (`nominal`) or of another machine (its name
@@ -295,9 +320,10 @@ class Servo(StrictModel):
 
 
 class PlantedEffect(StrictModel):
-    """An effect of the simulated machine that its nominal model does not have.
+    """An effect of the simulated machine that is not in its nominal model, such as a leakage.
 
-    `hydrotele list effects` lists the names.
+    `location` is the axis or part, and `parameters` are those of the effect. `hydrotele list effects`
+    lists the names.
     """
 
     name: str
@@ -306,7 +332,12 @@ class PlantedEffect(StrictModel):
 
 
 class Scenario(StrictModel):
-    """Complete specification of one run; the same scenario gives bit-identical results."""
+    """Complete specification of one simulated run; the same scenario gives bit-identical results.
+
+    `timestep` [s] is that of the physics, `control_rate` and `log_rate` [Hz] are the rates of
+    controller and log, and `seed` that of all random numbers. `sensors` names a sensor set of the
+    machine.
+    """
 
     name: Name
     description: str = ""
@@ -361,7 +392,7 @@ class Scenario(StrictModel):
 
 
 def shipped_scenarios() -> list[str]:
-    """Return the names of the scenarios in the package."""
+    """Return the sorted names of the scenario files that the package contains."""
     return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
 
 
@@ -388,7 +419,7 @@ class ScenarioFile(NamedTuple):
     Attributes:
         path: the file.
         data: its keys and values.
-        lines: key path -> line number, starting at 1.
+        lines: key path, a tuple such as `("pilot", "file")` -> line number, starting at 1.
     """
 
     path: Path
@@ -397,7 +428,9 @@ class ScenarioFile(NamedTuple):
 
 
 def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
-    """Read a scenario file, from which `make_scenario` can make several scenarios.
+    """Read a shipped or own scenario file without validation.
+
+    `make_scenario` can make several scenarios from the result, each with its own overrides.
 
     Raises:
         InputError: the scenario does not exist, or the file is not a YAML mapping.
@@ -407,7 +440,7 @@ def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
 
 
 def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
-    """Read and validate a scenario.
+    """Read a scenario from a shipped or own YAML file, replace given values, and validate it.
 
     Args:
         name_or_path: name of a shipped scenario or path of a YAML file.
@@ -423,7 +456,10 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
 
 
 def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
-    """Make a scenario from the content of its file, with overrides as in `load_scenario`.
+    """Validate the content of a scenario file, after replacing values.
+
+    `overrides` maps dotted key paths to YAML text, such as `servo.position_gain` to `2`. The file of a
+    table pilot is read into the scenario.
 
     Raises:
         InputError: the file is not valid; the message names file, line, key path and valid values.
@@ -448,7 +484,10 @@ def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
 
 
 def _load_table(scenario: Scenario, where: str) -> Scenario:
-    """Replace the file of a table pilot by its columns, so that the scenario is self-contained."""
+    """Replace the log file of a table pilot by its columns, so that the scenario is self-contained.
+
+    `where` names file, line and key in error messages. Raise InputError for an unsuitable log.
+    """
     pilot = scenario.pilot
     if not isinstance(pilot, TablePilot) or pilot.file is None:
         return scenario
@@ -470,14 +509,17 @@ def _load_table(scenario: Scenario, where: str) -> Scenario:
 
 
 def find_local_machine(scenario: Scenario) -> Path | None:
-    """Return the machine file or folder next to the scenario file, None for a shipped machine."""
+    """Return the path of a scenario's own machine, or None if its machine is a shipped one.
+
+    An own machine is a file or folder relative to the folder of the scenario file.
+    """
     path = Path(scenario.folder, scenario.machine)
     beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
     return path if beside else None
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
-    """Write a scenario with all defaults as YAML that `load_scenario` can read."""
+    """Write a scenario with all its values, defaults included, as YAML that `load_scenario` can read."""
     data = scenario.model_dump(mode="json")
     beside = find_local_machine(scenario)
     data["machine"] = str(beside) if beside else scenario.machine
@@ -510,7 +552,9 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
 
 
 def logged_soil(log: Log) -> tuple[SoilGround, ...]:
-    """Return the soil that the bucket could dig during a run, from the metadata of its log; empty if there was none.
+    """Read from a log's metadata the soil that the bucket could dig during the run.
+
+    The result has one element, or is empty if the run had no soil.
 
     Raises:
         InputError: the metadata are damaged.

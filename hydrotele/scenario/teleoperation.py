@@ -1,8 +1,8 @@
 """Specification of teleoperated runs: joystick, force reflection, operator, channel, safety.
 
 The joystick axes x, y, z [m], rx, ry, rz [rad] move the task coordinates of the arm: r, z [m],
-theta, attitude and head [rad]. All values are in SI units and frozen; keys may have units as
-suffixes.
+theta, attitude and head [rad] (cylindrical coordinates about the swing axis, pitch and rotation of
+the tool). All values are in SI units and frozen; keys may have units as suffixes.
 """
 
 import math
@@ -39,7 +39,10 @@ class CoordinateMapping(StrictModel):
     scale: PositiveFloat = 100.0
 
     def resolve_axis(self, coordinate: str) -> tuple[str, float]:
-        """Return the joystick axis and sign, with the defaults of the coordinate if not given."""
+        """Return the joystick axis that moves a coordinate, and the sign (+1 or -1) of its direction.
+
+        Values that are not given are the defaults of the coordinate.
+        """
         axis, sign = _DEFAULT_AXES[coordinate]
         return self.axis or axis, float(self.sign or sign)
 
@@ -108,7 +111,10 @@ class TipOver(StrictModel):
 
 
 class SensorFault(StrictModel):
-    """A sensor that freezes at the time `start` [s], such as `angle.boom` or `pressure_rod.stick`."""
+    """Sensor fault: from the time `start` [s] on, a sensor repeats its last reading.
+
+    `channel` names the sensor, such as `angle.boom` or `pressure_rod.stick`.
+    """
 
     renamed = {"at": "start"}
 
@@ -117,7 +123,10 @@ class SensorFault(StrictModel):
 
 
 class ButtonCommand(StrictModel):
-    """Command of an axis that the joystick does not move (saw, grab), from `start` [s] on."""
+    """Command of an axis that the joystick does not move (saw, grab), from `start` [s] on.
+
+    `command` is that of the valve or drive [1] or [V].
+    """
 
     renamed = {"at": "start"}
 
@@ -133,7 +142,10 @@ def _check_time(time: list[float]) -> None:
 
 
 class FollowPath(StrictModel):
-    """The operator moves the handle along a path of displacements [m] or [rad] over `time` [s]."""
+    """The operator moves the handle along a given path.
+
+    `path` gives the displacements of the joystick axes [m] or [rad] at each `time` [s].
+    """
 
     kind: Literal["follow"]
     time: list[NonNegativeFloat] = [0.0]
@@ -168,10 +180,12 @@ class ForceTarget(StrictModel):
 
 
 class RegulateForce(StrictModel):
-    """The operator regulates a contact force by the reflected force alone.
+    """The operator regulates a contact force to its target by the reflected force alone.
 
-    The operator knows how joystick and machine map the contact force to the hand (K_nom and K_r, or
-    the direct ratio), and pushes as an operator does under rate control.
+    The operator knows how the joystick displays a contact force to the hand: by its nominal stiffness
+    and stiffness per force, or by the ratio of direct reflection. The operator corrects the force by
+    pushes of the handle. `approach` is the handle displacement before contact, as a fraction of its
+    range beyond the dead band.
     """
 
     kind: Literal["regulate"]
@@ -183,7 +197,8 @@ class TrackForce(StrictModel):
     """The operator tracks a displayed force trajectory, seen with delay and noise.
 
     `display: both` shows the target and the contact force from the machine's sensors. `target`
-    shows the target alone, so that the operator has to feel or to estimate the force.
+    shows the target alone, so that the operator has to feel or to estimate the force. `approach` is
+    the handle displacement before contact, as a fraction of its range beyond the dead band.
     """
 
     kind: Literal["track"]
@@ -297,7 +312,10 @@ class OperatorSettings(StrictModel):
 
 
 def _get_kind(value: object) -> object:
-    """Return the kind of an operator; `recorded` if the kind is omitted but the file is given."""
+    """Return the key `kind` of an operator's data, which selects the class that validates it.
+
+    The kind is `recorded` if it is omitted and the key `recorded` is given, and otherwise None.
+    """
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return "recorded" if kind is None and isinstance(value, dict) and "recorded" in value else kind
 
@@ -334,7 +352,8 @@ class TeleopPilot(StrictModel):
     Stability and limits of the structures:
 
     - `stiffness`: proven stable with every environment and delay if `B^2 > 4 M K_max` and
-      `K_min > 0`, hand included (Zhu 1994, theorem 4-2). The published gains do not meet this
+      `K_min > 0`, with mass M, damping B and stiffness bounds K_min and K_max of joystick and hand
+      together (Zhu 1994, theorem 4-2). The published gains do not meet this
       condition; they are stable by the bound for the worst switching (`hydrotele analyse teleop`).
     - `direct_force`: bounces if `ratio` times the environment stiffness (times `scale`) exceeds the
       stiffness of hand and joystick.
@@ -345,11 +364,12 @@ class TeleopPilot(StrictModel):
     - `four_channel` under position control: in the mean, hand force = ratio x contact force and
       position = scale x handle. On a valve-controlled machine it bounces unless ratio x scale x
       environment stiffness is below the coupling, about 400 N/m. Under rate control it does not
-      reflect a constant contact force, by design (F_h = s/k_v F_e), and has no dead band.
-    - `impedance`: adds ratio x gain of the coordinate (its scale, or under rate control its rate
-      per displacement, for one second) x the identified environment stiffness to the stiffness of
-      the joystick, within its bounds. It likewise adds damping, at most that of the joystick, and
-      mass, at most half of that of the flotor.
+      reflect a constant contact force, by design (F_h = s/k_v F_e, with hand force F_h, contact force
+      F_e and rate gain k_v), and has no dead band.
+    - `impedance`: adds the identified environment stiffness, times `ratio` and the gain of the
+      coordinate, to the stiffness of the joystick, within its bounds. The gain is the coordinate's
+      `scale`, or under rate control its rate per displacement, for one second. It likewise adds
+      damping, at most that of the joystick, and mass, at most half of that of the flotor.
     - `wave_variables` (impedance `wave_impedance` [N s/m]) and `passivity_control`: make the channel passive
       with any delay and jitter, under position control. A virtual mass follows the handle through
       the coupling, whose force is sent back, and the contact force moves it. The channel cannot

@@ -1,8 +1,9 @@
 """Linear analysis of a teleoperator: transparency, passivity, stability and stability margins.
 
-The module describes one axis of a teleoperator (master, slave, controllers, operator's hand, task,
-gains, delays) and analyses its two-port network. The parameters come from a YAML file that
-`hydrotele analyse teleop` reads. `hydrotele/teleop/cat215_axis.yaml` is the default file; it gives
+A teleoperator couples a master, which the operator's hand moves, with a slave, which acts on the
+task. The module describes one axis of it (impedances, controllers, channel gains, delays) and
+analyses it as a two-port network. The parameters come from a YAML file that `hydrotele analyse
+teleop` reads. `hydrotele/teleop/cat215_axis.yaml` is the default file; it gives
 the source of every parameter.
 """
 
@@ -44,7 +45,9 @@ from hydrotele.teleop.two_port import (
 
 @dataclass(frozen=True)
 class TeleoperatorAxis:
-    """One axis of a teleoperator with hand and task, all in one scale of lengths and forces.
+    """One axis of a teleoperator with hand and task.
+
+    Slave and task are scaled to the lengths and forces of the master.
 
     Attributes:
         master: impedance of the master, which the hand moves.
@@ -56,7 +59,8 @@ class TeleoperatorAxis:
         gains: gains of the channels.
         delay_forward: delay from the master to the slave [s].
         delay_back: delay from the slave to the master [s].
-        wave: impedance b of wave variables [N s/m]; 0 selects the slave controller's damping.
+        wave: wave impedance b, for the structure with wave variables [N s/m]; 0 selects the slave
+            controller's damping.
     """
 
     master: Impedance
@@ -77,26 +81,26 @@ class TeleoperatorAxis:
 
     @property
     def delay(self) -> float:
-        """Mean of both delays [s]; stability depends only on their sum."""
+        """Mean of the forward and the return delay [s]; stability depends only on their sum."""
         return 0.5 * (self.delay_forward + self.delay_back)
 
     def with_delay(self, delay: float) -> "TeleoperatorAxis":
-        """Return the case with a delay [s] in each direction."""
+        """Return a copy of the axis with the same delay [s] in each direction."""
         return replace(self, delay_forward=delay, delay_back=delay)
 
     def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """Return the two-port of a structure.
+        """Return the linear two-port of this axis with a given control structure.
 
         Args:
-            structure: see `make_two_port`.
-            reflected: factor on both return channels C2 and C4, which is the gain of the loop
-                through hand and task [1].
+            structure: name, one of `STRUCTURES`, such as `position_force`.
+            reflected: factor on both return channels, force C2 and velocity C4, which is the gain of
+                the loop through hand and task [1].
 
         Returns:
             The two-port.
 
         Raises:
-            InputError: see `make_two_port`.
+            InputError: the structure is not known, or a gain or a delay is invalid.
         """
         made = make_two_port(
             structure, self.master, self.slave, self.master_control, self.slave_control,
@@ -126,42 +130,46 @@ Delay = Annotated[float, Field(ge=0, le=MAX_DELAY)]
 
 
 class ImpedanceParameters(StrictModel):
-    """Mass [kg], damping [N s/m] and stiffness [N/m] of a body, the hand or the task."""
+    """Mass [kg], damping [N s/m] and stiffness [N/m] of the hand or the task."""
 
     mass: NonNegativeFloat = 0.0
     damping: NonNegativeFloat = 0.0
     stiffness: NonNegativeFloat = 0.0
 
     def impedance(self) -> Impedance:
-        """Return the impedance as a function of frequency."""
+        """Convert the data of the file to an `Impedance`, a function of complex frequency."""
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
 class BodyParameters(StrictModel):
-    """Mass [kg], damping [N s/m] and stiffness [N/m] of the master or the slave."""
+    """Mass [kg], damping [N s/m] and stiffness [N/m] of the master or the slave, without control."""
 
     mass: PositiveFloat
     damping: NonNegativeFloat = 0.0
     stiffness: NonNegativeFloat = 0.0
 
     def impedance(self) -> Impedance:
-        """Return the impedance as a function of frequency."""
+        """Convert the data of the file to an `Impedance`, a function of complex frequency."""
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
 class ControllerParameters(StrictModel):
-    """Damping [N s/m] and stiffness [N/m] of a controller."""
+    """Damping [N s/m] and stiffness [N/m] of the controller of master or slave."""
 
     damping: NonNegativeFloat = 0.0
     stiffness: NonNegativeFloat = 0.0
 
     def impedance(self) -> Impedance:
-        """Return the impedance as a function of frequency."""
+        """Convert the data of the file to an `Impedance`, a function of complex frequency."""
         return Impedance(0.0, self.damping, self.stiffness)
 
 
 class ChannelGains(StrictModel):
-    """Gains of the channels, see `make_two_port.Gains`; velocity in 1/s."""
+    """Gains of the channels between master and slave.
+
+    `position` is the slave's position per master position [1], `velocity` the slave's velocity per
+    master position under rate control [1/s], `force` the reflected per environment force [1].
+    """
 
     position: PositiveFloat = 1.0
     velocity: PositiveFloat = 1.0
@@ -176,7 +184,10 @@ class Delays(StrictModel):
 
 
 class StiffnessFeedbackAxis(StrictModel):
-    """Joystick axis with stiffness feedback, without the hand, which is added to it."""
+    """Joystick axis whose stiffness follows the machine's force, without the operator's hand.
+
+    Stiffnesses [N/m], `damping` [N s/m] and `mass` [kg]; the analysis adds the hand.
+    """
 
     renamed = {"nominal": "nominal_stiffness", "least": "min_stiffness", "most": "max_stiffness"}
 
@@ -196,12 +207,15 @@ class StiffnessFeedbackAxis(StrictModel):
         return self
 
     def to_spring(self) -> StiffnessAxis:
-        """Return the axis as input of the stability theorem."""
+        """Convert the data of the file to a `StiffnessAxis`, which tests the stability theorem."""
         return StiffnessAxis(self.mass, self.damping, self.nominal_stiffness, self.min_stiffness, self.max_stiffness)
 
 
 class MapRange(StrictModel):
-    """Range of the stability map: delay in each direction [s], factor on the return channels."""
+    """Range of the stability map, a grid of delay and return gain with `points` values of each.
+
+    `max_delay` is the largest delay in each direction [s]; the factors multiply the return channels.
+    """
 
     renamed = {
         "longest_delay": "max_delay", "least_factor": "min_factor", "most_factor": "max_factor",
@@ -220,7 +234,7 @@ class MapRange(StrictModel):
 
 
 class ImpedanceRange(StrictModel):
-    """Range of impedances for random sampling, log-uniform between `min` and `max`."""
+    """Range of mass, damping and stiffness for random sampling, log-uniform from `min` to `max`."""
 
     renamed = {"least": "min", "most": "max"}
 
@@ -236,7 +250,12 @@ class ImpedanceRange(StrictModel):
 
 
 class TeleopCaseFile(StrictModel):
-    """Complete input of an analysis: one axis, all in one scale of lengths and forces."""
+    """Contents of a YAML file for `hydrotele analyse teleop`: one axis, and what to analyse.
+
+    Slave and task are scaled to the lengths and forces of the master. `structures` are the control
+    structures to compare, `stiffness` an optional joystick axis with stiffness feedback. `hands` and
+    `tasks` are ranges for random sampling, `map` is the range of the stability map.
+    """
 
     renamed = {"wave": "wave_impedance"}
 
@@ -272,10 +291,10 @@ class TeleopCaseFile(StrictModel):
 
 
 def check_structures(names: tuple[str, ...], known: tuple[str, ...] = STRUCTURES) -> tuple[str, ...]:
-    """Return the names without duplicates.
+    """Check names of control structures and return them without duplicates.
 
     Raises:
-        ValueError: a name is not known.
+        ValueError: a name is not in `known`.
     """
     for name in names:
         if name not in known:
@@ -284,13 +303,13 @@ def check_structures(names: tuple[str, ...], known: tuple[str, ...] = STRUCTURES
 
 
 def load_teleop_case(path: str | Path | None = None) -> TeleopCaseFile:
-    """Read a case from a YAML file.
+    """Read and validate the YAML file that describes a teleoperator axis for the linear analysis.
 
     Args:
         path: YAML file, None for the default file.
 
     Returns:
-        The case.
+        The validated contents.
 
     Raises:
         InputError: the file is invalid; the message gives file, line, key and the allowed values.
@@ -312,7 +331,10 @@ _TESTED_DELAY_RANGE = (1e-4, MAX_TESTED_DELAY)
 
 
 class StabilityLoop(Protocol):
-    """Interface of a teleoperator with hand and task for stability tests, such as a `TeleoperatorAxis`."""
+    """Interface that the stability tests need: hand, task, delays and two-port of a teleoperator.
+
+    `TeleoperatorAxis` and `LinearCase` provide it.
+    """
 
     @property
     def task(self) -> Block:
@@ -325,25 +347,30 @@ class StabilityLoop(Protocol):
         ...
 
     def with_delay(self, delay: float) -> "StabilityLoop":
-        """Return the loop with a delay [s] in each direction."""
+        """Return a copy of the loop with the same delay [s] in each direction."""
         ...
 
     def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """Return the two-port of a structure; `reflected` is a factor on the return channels."""
+        """Return the linear two-port with a control structure.
+
+        `reflected` is a factor on the channels from the slave to the master [1].
+        """
         ...
 
 
 @dataclass(frozen=True)
 class StructureAnalysis:
-    """Results of the analysis of one structure.
+    """Results of the linear analysis of one control structure.
 
     Attributes:
         structure: name of the structure.
-        frequencies: (n,) [rad/s].
-        hybrid_matrices: (n, 2, 2) hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
+        frequencies: (n,) frequencies of the arrays below [rad/s].
+        hybrid_matrices: (n, 2, 2) hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`: force and
+            velocity at hand (h) and environment (e).
         transmitted_impedance: (n,) impedance transmitted to the operator [N s/m].
         task_impedance: (n,) impedance of the task [N s/m].
-        scattering_norms: (n,) largest singular value of the scattering matrix [1].
+        scattering_norms: (n,) largest singular value of the scattering matrix [1]; a passive
+            two-port has none above 1.
         loop_gains: (n,) gain of the loop through hand and task [1].
         loop_free: (n,) loop gain without a task [1].
         unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
@@ -389,7 +416,7 @@ class StructureAnalysis:
 def analyse_structure(
     case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = FREQUENCIES
 ) -> StructureAnalysis:
-    """Analyse the stability, passivity and transparency of a structure.
+    """Analyse stability, passivity and transparency of a teleoperator with one control structure.
 
     Args:
         case: teleoperator with hand and task.
@@ -426,7 +453,9 @@ def loop_gain(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: 
         environment: impedance of the task; with a zero impedance the result is Zhu's LG1.
 
     Returns:
-        (...) `(C2 Z_e + C4)(C1 - C3 Z_h) / ((Z_m + C_m + Z_h)(Z_s + C_s + Z_e))` [1].
+        (...) `(C2 Z_e + C4)(C1 - C3 Z_h) / ((Z_m + C_m + Z_h)(Z_s + C_s + Z_e))` [1], with channels
+        C1 .. C4 as in `TwoPort`, impedances Z and controllers C_m, C_s; indices m master, s slave,
+        h hand, e environment.
 
     Source: Zhu 1994, 3.13.
     """
@@ -438,7 +467,10 @@ def loop_gain(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: 
 
 
 def reference_impedance(case: TeleoperatorAxis) -> float:
-    """Return the reference impedance `sqrt(B^2 + M K)` of the hand [N s/m], 1 if it is zero."""
+    """Return a reference impedance for scattering matrices: `sqrt(B^2 + M K)` of the hand [N s/m].
+
+    M, B and K are the hand's mass, damping and stiffness. The result is 1 if this is zero.
+    """
     hand = case.hand
     return math.hypot(hand.damping, math.sqrt(hand.mass * hand.stiffness)) or 1.0
 
@@ -453,6 +485,7 @@ def is_passive(port: TwoPort, unit: float = 1.0) -> bool:
     Returns:
         True if the scattering matrix has no pole in the right half-plane, and no norm above 1 on
         the imaginary axis.
+
     Source: Anderson and Spong 1989; Zhu 1994, 3.7.
     """
     s = 2j * np.pi * np.geomspace(1e-3, 2e3, 3000)
@@ -466,7 +499,10 @@ def is_passive(port: TwoPort, unit: float = 1.0) -> bool:
 
 
 def is_strictly_stable(port: TwoPort, hand: Block, environment: Block) -> bool:
-    """Return whether a loop is stable; a pole on the imaginary axis counts as unstable."""
+    """Return whether hand, teleoperator and task have only poles in the left half-plane.
+
+    A pole on the imaginary axis, which cannot be counted, makes the loop unstable.
+    """
     try:
         return is_stable(port, hand, environment)
     except PoleOnAxisError:
@@ -481,7 +517,11 @@ def _count_poles_or_none(port: TwoPort, hand: Block, environment: Block) -> int 
 
 
 def gain_margin(case: StabilityLoop, structure: str) -> float:
-    """Return the factor on the return channels at which stability changes; see `StructureAnalysis`."""
+    """Return the factor on the return channels at which stability changes [1].
+
+    For a stable case it is the largest stable factor, infinite if all factors up to 1000 are stable.
+    For an unstable case it is below 1, and 0 if no factor down to 0.001 stabilises it.
+    """
 
     def is_stable_with(factor: float) -> bool:
         return is_strictly_stable(case.make_port(structure, factor), case.hand, case.task)
@@ -494,7 +534,10 @@ def gain_margin(case: StabilityLoop, structure: str) -> float:
 
 
 def find_max_delay(case: StabilityLoop, structure: str) -> float:
-    """Return the delay in each direction up to which the loop is stable [s]; see `StructureAnalysis`."""
+    """Return the delay in each direction up to which the loop is stable [s].
+
+    It is 0 if the loop is unstable without delay, and infinite if it is stable up to 10 s.
+    """
 
     def is_stable_with(delay: float) -> bool:
         return is_strictly_stable(case.with_delay(delay).make_port(structure), case.hand, case.task)
@@ -511,11 +554,12 @@ def find_first_change(condition: Callable[[float], bool], points: np.ndarray) ->
     """Return where a condition first differs from its value at the first point, None if nowhere.
 
     Args:
-        condition: the condition.
-        points: (n,) positive ordered values that are tested before the result is refined.
+        condition: function of one positive number.
+        points: (n,) positive values in rising or falling order. They are tested in this order; the
+            interval of the first change is then bisected.
 
     Returns:
-        The last value at which the condition is true, refined to 0.1 %.
+        The value next to the change at which the condition is true, to 0.1 %.
     """
     first, last = condition(float(points[0])), float(points[0])
     for point in map(float, points[1:]):
@@ -531,7 +575,7 @@ def find_first_change(condition: Callable[[float], bool], points: np.ndarray) ->
 
 
 def stability_map(case: StabilityLoop, structure: str, delays: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Return where a structure is stable on a grid of delays and return gains.
+    """Test the stability of a control structure on a grid of delays and gains of the return channels.
 
     Args:
         case: teleoperator with hand and task.

@@ -1,4 +1,4 @@
-"""Parameters of the joystick's axes, as a table with the gains of joystick and scenario.
+"""Parameter table of the six joystick axes, built from the joystick's file and the scenario.
 
 The module also provides named tuples of arrays that are contiguous in memory. Such a state is
 logged and passed to a compiled function as one array, since the call overhead of a compiled
@@ -37,7 +37,7 @@ _COUPLING_TIME = 0.1  # s, ratio of damping to stiffness of that coupling
 
 
 def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]) -> np.ndarray:
-    """Build the parameter table of all joystick axes.
+    """Build the table of control parameters of all joystick axes for the compiled code.
 
     Args:
         joystick: the joystick.
@@ -45,7 +45,8 @@ def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[
         coordinates: task coordinates of the arm.
 
     Returns:
-        (6, 18), columns above.
+        (6, 18), one row per joystick axis; the constants NOMINAL_STIFFNESS to AXIS_WAVE_IMPEDANCE of
+        this module number the columns. SI units.
 
     Raises:
         InputError: inconsistent gains, a coordinate that the arm does not have, one joystick axis
@@ -79,7 +80,11 @@ def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[
 
 
 def _assign_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
-    """Assign every coordinate to its joystick axis."""
+    """Write coordinate, sign and gain of every task coordinate to the row of its joystick axis.
+
+    Raise InputError for a coordinate that the arm does not have, an axis with two coordinates, or an
+    axis whose dead band covers its whole range.
+    """
     where = "pilot.coordinates"
     if strange := set(pilot.coordinates) - set(coordinates):
         message = f"{', '.join(sorted(strange))}: the arm has {', '.join(coordinates)}"
@@ -100,7 +105,10 @@ def _assign_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> N
 
 
 def _merge_gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
-    """Return the gains of a joystick axis, with the overrides of the scenario."""
+    """Return stiffness, damping and limits of joystick axis `name`, with the scenario's replacements.
+
+    Raise InputError for invalid values of the scenario.
+    """
     usual = joystick.gains[pilot.gains][name].model_dump()
     own = {str(axis): gains for axis, gains in pilot.stiffness.items()}.get(name, {})
     said = {split_unit(key)[0] for key in own}
@@ -109,7 +117,10 @@ def _merge_gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains
 
 
 def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
-    """Raise InputError if the operator's goal is not a coordinate of the arm or cannot be moved."""
+    """Raise InputError if the simulated operator's target is a coordinate that cannot be moved.
+
+    The arm must have the coordinate, and the dead band must not cover the range of its joystick axis.
+    """
     goals: dict[str, str] = {}
     match pilot.operator:
         case RegulateForce() | TrackForce():
@@ -129,7 +140,7 @@ StateType = TypeVar("StateType", bound=tuple[Any, ...])
 
 
 def make_flat_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> StateType:
-    """Create a named tuple of zero arrays that are contiguous in memory.
+    """Create a named tuple of zero arrays that together are one contiguous block of memory.
 
     Args:
         kind: NamedTuple type of arrays.
@@ -148,7 +159,11 @@ def make_flat_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> Sta
 
 
 def flatten_state(parts: StateType) -> StateType:
-    """Copy a tuple of arrays, as floats, into contiguous memory."""
+    """Copy a named tuple of arrays, as floats, into one contiguous block of memory.
+
+    Returns:
+        A tuple of the same type and shapes; `flat_view` returns its memory as one array.
+    """
     arrays = [np.asarray(part, float) for part in parts]
     made = make_flat_state(type(parts), [array.shape for array in arrays])
     for place, array in zip(made, arrays, strict=True):
@@ -157,12 +172,15 @@ def flatten_state(parts: StateType) -> StateType:
 
 
 def flat_view(parts: tuple[Any, ...]) -> np.ndarray:
-    """Return the memory of a `make_flat_state` as one array."""
+    """Return the memory of a tuple of `make_flat_state` or `flatten_state` as one 1-D array.
+
+    It is a view: changes of the array change the parts of the tuple.
+    """
     base = parts[0].base
     return base if base.ndim == 1 else base.base
 
 
 @compiled
 def split_array(flat, size):
-    """Split an array after its first `size` elements."""
+    """Return views of the first `size` elements of an array and of the remaining ones."""
     return flat[:size], flat[size:]

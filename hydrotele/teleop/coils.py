@@ -1,7 +1,8 @@
 """Lorentz coils of a magnetically levitated joystick: map currents to a wrench, and the inverse.
 
 A coil in the field of its magnets pushes the flotor in a fixed direction, with a force that is
-proportional to its current. Six coils produce any force and torque: `[f; tau] = M I`.
+proportional to its current. Six coils produce any force f and torque tau on the flotor, the moving
+part of the joystick: `[f; tau] = M I` with the currents I.
 
 The currents heat the coils, which limits them over minutes. Detents reduce this heating: Zhu 1994,
 6.3, "a stiff joystick could easily cause heating problem".
@@ -19,7 +20,12 @@ _MAX_CONDITION_NUMBER = 1e6  # condition number above which six coils do not spa
 
 
 class CoilCurrents(NamedTuple):
-    """Coil currents (6,) [A], and whether the requested wrench was reduced to the limits."""
+    """Coil currents for a requested wrench.
+
+    Attributes:
+        value: (6,) currents [A].
+        is_limited: whether the wrench was reduced because a current exceeded its limit.
+    """
 
     value: np.ndarray
     is_limited: bool
@@ -27,7 +33,7 @@ class CoilCurrents(NamedTuple):
 
 @dataclass(frozen=True)
 class Coils:
-    """Six coils fixed to the flotor.
+    """Position, direction and limits of the six coils that are fixed to the flotor.
 
     Attributes:
         position: (6, 3) centres of the coils in the flotor's frame [m].
@@ -58,24 +64,33 @@ class Coils:
 
     @property
     def wrench_map(self) -> np.ndarray:
-        """Matrix M (6, 6): force [N] and torque about the frame's origin [N m] per ampere."""
+        """Matrix (6, 6) that maps coil currents [A] to force [N] and torque [N m] on the flotor.
+
+        Both are in the axes of the flotor's frame; the torque is about its origin.
+        """
         force = self.force_per_ampere * np.asarray(self.direction, float)
         return np.vstack([force.T, np.cross(self.position, force).T])
 
     @property
     def condition(self) -> float:
-        """Condition number of the map, with torques divided by the coils' mean distance."""
+        """Condition number of `wrench_map`, with torques divided by the coils' mean distance.
+
+        A large number means that some force or torque needs very large currents.
+        """
         arm = float(np.mean(np.linalg.norm(self.position, axis=1)))
         scale = np.array([1.0, 1.0, 1.0, *([1.0 / max(arm, 1e-12)] * 3)])
         return float(np.linalg.cond(scale[:, None] * self.wrench_map))
 
     def compute_wrench(self, currents: np.ndarray) -> np.ndarray:
-        """Return the wrench (6,) [N], [N m] of currents (6,) [A], after limiting each current."""
+        """Return the force [N] and torque [N m] (6,) that currents (6,) [A] produce.
+
+        Each current is first limited to `max_current`.
+        """
         limit = self.max_current
         return self.wrench_map @ np.clip(np.asarray(currents, float), -limit, limit)
 
     def compute_currents(self, wrench: np.ndarray) -> CoilCurrents:
-        """Compute the coil currents for a force and torque.
+        """Compute the coil currents that produce a force and torque on the flotor.
 
         A wrench above the limits is scaled down as a whole, so that it keeps its direction. Coils
         that saturate one by one would twist the operator's hand.
@@ -98,7 +113,7 @@ class Coils:
 
 
 def make_three_station_coils(radius: float, force_per_ampere: float, max_current: float) -> Coils:
-    """Create three stations at 120 degrees, each with one vertical and one tangential coil.
+    """Create the six coils of three stations at 120 degrees, one vertical and one tangential each.
 
     With torques divided by the radius, the condition number is the square root of 2.
 
@@ -137,7 +152,7 @@ def relative_heating(currents: np.ndarray, continuous: float) -> float:
 
 
 def time_to_overheat(currents: np.ndarray, continuous: float, time_constant: float) -> float:
-    """Return the time for which cold coils can carry currents.
+    """Return the time after which cold coils reach their permitted temperature at given currents.
 
     Args:
         currents: (6,) constant currents [A].
@@ -147,7 +162,7 @@ def time_to_overheat(currents: np.ndarray, continuous: float, time_constant: flo
     Returns:
         Time [s]; infinite if they can carry the currents continuously.
 
-    Source: `simulate.joystick.heat_step`.
+    Source: first-order heating as in `simulate.joystick.heat_step`.
 
     >>> round(time_to_overheat(np.full(6, 4.0), 2.0, 60.0), 3)
     17.261

@@ -18,11 +18,13 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True)
 class Flotor:
-    """Moving part of the joystick, in the coils' frame, which is fixed to it.
+    """Inertial parameters of the flotor, the moving part of a levitated joystick.
+
+    They are expressed in the coils' frame, which is fixed to the flotor.
 
     Attributes:
         mass: mass [kg].
-        centre_of_mass: (3,) [m].
+        centre_of_mass: (3,) position of the centre of mass [m].
         inertia: (3, 3) about the centre of mass [kg m^2].
     """
 
@@ -39,7 +41,7 @@ class Flotor:
 
 @dataclass(frozen=True)
 class AxisDynamics:
-    """Second-order systems of the three translations and the three rotations.
+    """Designed second-order responses of the handle's three translations and three rotations.
 
     Attributes:
         frequency: (6,) natural frequencies [rad/s].
@@ -76,16 +78,16 @@ class FlotorMotion:
 
 @compiled
 def quaternion_to_matrix(q, out):
-    """Convert a unit quaternion to a rotation matrix.
+    """Convert a unit quaternion to a rotation matrix, body to world axes.
 
     Args:
-        q: (4,) scalar first.
-        out: (3, 3) written.
+        q: (4,) orientation of the body, scalar first.
+        out: (3, 3) rotation matrix, written.
 
     Returns:
         Nothing.
 
-    Source: definition.
+    Source: definition of the unit quaternion.
     """
     w, x, y, z = q[0], q[1], q[2], q[3]
     out[0, 0], out[0, 1], out[0, 2] = (
@@ -118,7 +120,7 @@ def free_flotor_wrench(
     gravity,
     out,
 ):
-    """Compute the coil wrench for given accelerations of the handle's point and the flotor.
+    """Compute the coil wrench that gives a free flotor the specified accelerations (inverse dynamics).
 
     Args:
         mass: mass of the flotor, scalar [kg].
@@ -129,8 +131,9 @@ def free_flotor_wrench(
         angular_acceleration: (3,) angular acceleration, flotor axes [rad/s^2].
         rotation: (3, 3) rotation matrix, flotor to world.
         rate: (3,) angular velocity, flotor axes [rad/s].
-        gravity: (3,) world axes [m/s^2].
-        out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
+        gravity: (3,) acceleration of gravity, world axes [m/s^2].
+        out: (6,) written: force [N] and torque about the origin of the coils' frame [N m], flotor
+            axes.
 
     Returns:
         Nothing.
@@ -175,8 +178,9 @@ def held_flotor_wrench(mass, centre_of_mass, handle, push, rotation, gravity, ou
         handle: (3,) handle's point relative to the coils' frame, flotor axes [m].
         push: (6,) force at the handle, world axes [N], and torque, flotor axes [N m].
         rotation: (3, 3) rotation matrix, flotor to world.
-        gravity: (3,) world axes [m/s^2].
-        out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
+        gravity: (3,) acceleration of gravity, world axes [m/s^2].
+        out: (6,) written: force [N] and torque about the origin of the coils' frame [N m], flotor
+            axes.
 
     Returns:
         Nothing.
@@ -200,21 +204,25 @@ def compliance_wrench(
     flotor: Flotor, axes: AxisDynamics, centre: np.ndarray, motion: FlotorMotion, target: np.ndarray,
     target_rotation: np.ndarray, gravity: Sequence[float] = GRAVITY,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the coil wrench that gives the handle the six second-order systems.
+    """Compute the coil wrench with which the handle moves to its target like six decoupled springs.
+
+    The position of a point T of the flotor and the orientation of the flotor approach their targets
+    as six independent second-order systems.
 
     Args:
-        flotor: the moving part.
-        axes: the six second-order systems.
-        centre: T in the coils' frame (3,) [m].
+        flotor: inertial parameters of the moving part.
+        axes: natural frequencies and damping ratios of the six systems.
+        centre: (3,) point T in the coils' frame [m].
         motion: pose and velocity of the flotor.
-        target: reference position of T (3,) [m].
-        target_rotation: reference orientation, quaternion (4,), scalar first.
-        gravity: (3,) [m/s^2].
+        target: (3,) reference position of T [m].
+        target_rotation: (4,) reference orientation, quaternion, scalar first.
+        gravity: (3,) acceleration of gravity, world axes [m/s^2].
 
     Returns:
-        (6,) force [N] and torque about the coils' frame [N m], in that frame's axes.
+        (6,) force [N] and torque about the origin of the coils' frame [N m], in that frame's axes.
 
-    Source: Zhu 1994, 5.1.3 (Euler quaternions, forces moved from T over the centre of mass to F).
+    Source: Zhu 1994, 5.1.3 (Euler quaternions; forces moved from T over the centre of mass to the
+    coils' frame).
     """
     spring, damper = axes.frequency**2, 2.0 * axes.damping_ratio * axes.frequency
     turn, w, out = np.empty((3, 3)), motion.angular_velocity, np.empty(6)
@@ -241,14 +249,15 @@ def _skew_matrix(v: np.ndarray) -> np.ndarray:
 
 
 def rotation_between(first: np.ndarray, then: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the rotation from one orientation to another, by at most 180 degrees.
+    """Return the quaternion of the rotation from one orientation to another, by at most 180 degrees.
 
     Args:
-        first: initial orientation, quaternion (4,), scalar first.
-        then: final orientation, quaternion (4,).
+        first: (4,) initial orientation, quaternion, scalar first.
+        then: (4,) final orientation, quaternion, scalar first.
 
     Returns:
-        Scalar part, at least 0, and vector part (3,), the same in the axes of both.
+        Scalar part, at least 0, and (3,) vector part of the quaternion. The vector has the same
+        components in the axes of both orientations.
 
     Source: Zhu 1994, 5.1.3 (Euler quaternions).
     """

@@ -1,6 +1,7 @@
 """Complete analysis of a teleoperator, its check by time simulation, and the results as JSON.
 
-The analysis covers several structures of one case: stability, maximum force-reflection ratio,
+A structure is a choice of signals that master and slave exchange, such as position forward and force
+back. The analysis covers several structures of one case: stability, maximum force-reflection ratio,
 maximum delay and the stability theorem of stiffness feedback. A scenario is analysed through its
 linear case. The describing function of a dead band gives its effect on the loop gain.
 
@@ -68,12 +69,14 @@ _MIN_STEP = 2e-6  # s, minimum step; a run with a smaller one takes minutes
 
 
 class ControlLaw(NamedTuple):
-    """Coefficients of a control law on the signals (10,).
+    """Control law of a structure: forces as linear combinations of the ten signals of the module.
 
     Attributes:
-        master_own: force of the master's own controller.
-        forward: force on the slave, C1 and C3, from delayed signals.
-        back: force on the master, C2 and C4, from delayed signals.
+        master_own: (10,) coefficients of the force of the master's own controller.
+        forward: (10,) coefficients of the force on the slave, from delayed signals of the master
+            (channels C1 and C3).
+        back: (10,) coefficients of the force on the master, from delayed signals of the slave
+            (channels C2 and C4).
     """
 
     master_own: np.ndarray
@@ -82,7 +85,7 @@ class ControlLaw(NamedTuple):
 
 
 class SimulatedRun(NamedTuple):
-    """Results of a simulated run.
+    """Results of one time simulation of a teleoperator axis.
 
     Attributes:
         max_speeds: (20,) maximum of the sum of master's and slave's speed in each twentieth of the run
@@ -95,10 +98,10 @@ class SimulatedRun(NamedTuple):
 
 
 def control_law(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> ControlLaw:
-    """Return the control law of a structure in the time domain.
+    """Return the control law of a structure as coefficients on time signals.
 
     Args:
-        case: the teleoperator.
+        case: parameters of the teleoperator axis.
         structure: name, one of `STRUCTURES`.
         reflected: factor on the return channels [1].
 
@@ -129,17 +132,23 @@ def control_law(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) 
 
 
 def motion_coefficients(impedance: Impedance, position: int) -> np.ndarray:
-    """Return coefficients (10,) of an impedance on a position and its two derivatives."""
+    """Return the coefficients (10,) with which an impedance acts on a motion, as a force.
+
+    Stiffness, damping and mass multiply the signals `position`, `position + 1` and `position + 2`:
+    a position and its two derivatives.
+    """
     made = np.zeros(10)
     made[position : position + 3] = impedance.stiffness, impedance.damping, impedance.mass
     return made
 
 
 def choose_time_step(case: TeleoperatorAxis) -> float:
-    """Return a time step that resolves the fastest mode that the masses can have together [s].
+    """Choose a time step that resolves the fastest mode of the coupled masses [s].
+
+    It is a fifth of the time constant of the fastest mode, at most 0.5 ms.
 
     Raises:
-        InputError: the step would be too small.
+        InputError: the step would be below 2 microseconds.
     """
     parts = (case.master, case.slave, case.master_control, case.slave_control, case.hand, case.task)
     lightest = min(part.mass for part in parts if part.mass)
@@ -170,14 +179,17 @@ def simulate_impulse(
             has decayed or has grown without bound.
 
     Returns:
-        Results of the run.
+        Largest speeds over the run; `is_growing` evaluates them.
     """
     seconds = max(seconds, _MIN_ROUND_TRIPS * 2.0 * case.delay)
     return _simulate_case(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
 
 
 def is_growing(run: SimulatedRun) -> bool:
-    """Return whether the motion grows: late speeds are larger than early ones."""
+    """Return whether the motion of a simulated run grows: late speeds exceed early ones.
+
+    After an early stop the last speed is compared with the initial one.
+    """
     reached = run.max_speeds[run.max_speeds > 0.0]
     if len(reached) < _BLOCKS:
         return bool(reached[-1] > _INITIAL_SPEED)
@@ -185,9 +197,10 @@ def is_growing(run: SimulatedRun) -> bool:
 
 
 def simulate_sine(case: TeleoperatorAxis, structure: str, frequency: float) -> complex:
-    """Return the impedance at the master while its motion is an imposed sine.
+    """Measure in simulation the impedance that an operator feels at the master at one frequency.
 
-    The settling time is increased until the result no longer changes.
+    The master's motion is an imposed sine. The settling time is doubled until the result no longer
+    changes.
 
     Args:
         case: teleoperator with its task.
@@ -195,7 +208,7 @@ def simulate_sine(case: TeleoperatorAxis, structure: str, frequency: float) -> c
         frequency: frequency of the sine [rad/s].
 
     Returns:
-        Force over velocity, measured over two periods [N s/m].
+        Complex ratio of hand force to velocity, measured over two periods [N s/m].
     """
     law, period = control_law(case, structure), 2.0 * math.pi / frequency
     felt = 0.0
@@ -231,10 +244,15 @@ def _simulate_case(
 def _build_equations(
     case: TeleoperatorAxis, law: ControlLaw, lags: tuple[int, int], imposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (4, 10) on current and (4, 20) on delayed signals: forward, then back.
+    """Return the four linear equations that give the unknown signals at a time step.
 
-    Rows: master, hand, slave, derivative of the slave's equation. The last row is used where the
-    slave's jerk is needed, and is otherwise `w'' = 0`.
+    Rows: master, hand, slave, and derivative of the slave's equation. The last row is used where the
+    slave's jerk is needed, and is otherwise `w'' = 0`. With `imposed` motion the second row is that
+    of the master's acceleration.
+
+    Returns:
+        Coefficients (4, 10) on the present signals, and (4, 20) on the delayed ones: ten delayed by
+        the forward channel, then ten by the return channel.
     """
     own = motion_coefficients(case.master, X) + law.master_own
     own[FORCE] -= 1.0
@@ -261,7 +279,10 @@ def _build_equations(
 def _fold_undelayed(
     there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return delayed coefficients; those without delay are moved to the current signals."""
+    """Subtract the coefficients of channels without delay from those of the present signals `now`.
+
+    Return the coefficients of both channels on delayed signals, zero for a channel without delay.
+    """
     found = []
     for part, lag in zip((there, here), lags, strict=True):
         if lag == 0:
@@ -273,7 +294,11 @@ def _fold_undelayed(
 
 @compiled
 def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
-    """Integrate; return largest speeds (20,) and Fourier sums of force and velocity (2,)."""
+    """Integrate a run step by step, after an initial velocity or with an imposed sine.
+
+    Return the largest speeds (20,) of the parts of the run [m/s], and the complex Fourier sums (2,) of
+    hand force and velocity at the imposed frequency.
+    """
     past = np.zeros((max(lags[0], lags[1]) + 2, 10))
     largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
     q, before, late = np.zeros(10), np.zeros(10), np.zeros(20)
@@ -305,7 +330,7 @@ def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured,
 
 @compiled
 def _interpolate_delayed(past, n, lags, beyond, late):
-    """Interpolate the delayed signals between two steps."""
+    """Write the delayed signals of both channels to `late` (20,), interpolated between two steps."""
     for side in range(2):
         if lags[side] > 0 and n > lags[side]:
             row, share = n - lags[side], beyond[side]
@@ -316,7 +341,7 @@ def _interpolate_delayed(past, n, lags, beyond, late):
 
 @compiled
 def _solve(q, late, inverse, known, delayed, frequency):
-    """Solve for accelerations, the hand's force and the slave's jerk."""
+    """Solve for both accelerations, the hand's force and the slave's jerk; write them to q (10,)."""
     for i in range(4):
         total = 0.0
         for j in range(20):
@@ -330,7 +355,11 @@ def _solve(q, late, inverse, known, delayed, frequency):
 
 @compiled
 def _advance(q, before, step, first):
-    """Advance speeds and impulse by second-order Adams-Bashforth, their integrals by trapezoids."""
+    """Advance the signals q (10,) by one step.
+
+    Speeds and impulse use the second-order Adams-Bashforth formula, their integrals the trapezoidal
+    rule. `before` holds the derivatives of the previous step.
+    """
     if first:
         before[:] = q
     x, v, w = q[X], q[V], q[W]
@@ -348,7 +377,7 @@ SWEEP_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency 
 
 @dataclass(frozen=True)
 class SineSweep:
-    """Transmitted impedance in a simulated sine sweep.
+    """Impedance that is transmitted to the operator, from the formula and from simulated sines.
 
     Attributes:
         structure: name of the structure.
@@ -369,7 +398,10 @@ class SineSweep:
 
     @property
     def max_relative_error(self) -> float | None:
-        """Largest relative error [1], None if no measurement is possible."""
+        """Largest difference of measured and predicted impedance, relative to the latter [1].
+
+        None if no measurement is possible.
+        """
         if not len(self.measured):
             return None
         return float(np.max(np.abs(self.measured / self.expected - 1.0)))
@@ -377,7 +409,7 @@ class SineSweep:
 
 @dataclass(frozen=True)
 class StabilityComparison:
-    """Predicted and simulated stability on a grid.
+    """Predicted and simulated stability on a grid of delays and factors on the return channels.
 
     Attributes:
         structure: name of the structure.
@@ -395,12 +427,12 @@ class StabilityComparison:
 
     @property
     def agreement_fraction(self) -> float:
-        """Fraction of the grid cells with equal prediction and simulation [1]."""
+        """Fraction of the grid cells in which linear prediction and simulation agree [1]."""
         return float(np.mean(self.predicted == self.simulated))
 
 
 def run_sine_sweep(case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = SWEEP_FREQUENCIES) -> SineSweep:
-    """Compute the transmitted impedance and measure it with imposed sines in simulation.
+    """Compute the impedance transmitted to the operator, and measure it in simulation with sines.
 
     Args:
         case: teleoperator with its task.
@@ -421,7 +453,7 @@ def run_sine_sweep(case: TeleoperatorAxis, structure: str, frequencies: np.ndarr
 def compare_stability(
     case: TeleoperatorAxis, structure: str, delays: np.ndarray, factors: np.ndarray
 ) -> StabilityComparison:
-    """Predict and simulate stability in every cell of a stability map.
+    """Predict stability linearly and by simulation, for all pairs of a delay and a return gain.
 
     Args:
         case: teleoperator with hand and task.
@@ -446,7 +478,7 @@ _JSON_FREQUENCY_STEP = 40  # step of the frequencies that are written to the JSO
 
 @dataclass(frozen=True)
 class TeleopFindings:
-    """Results of an analysis of several structures.
+    """Results of the analysis of a case file with several control structures.
 
     Attributes:
         name: name of the case.
@@ -457,7 +489,7 @@ class TeleopFindings:
         maps: structure -> (m, n), true where stable.
         spring: joystick axis with stiffness feedback, None without.
         sweeps: simulated sine sweeps, empty if not requested.
-        agreements: simulated maps, empty if not requested.
+        agreements: predicted and simulated maps, empty if not requested.
         robustness_results: robustness of every sampled structure, empty if not requested.
         period: sampling period [s].
     """
@@ -479,7 +511,7 @@ def analyse_structures(
     name: str, case: TeleoperatorAxis, structures: tuple[str, ...], delays: np.ndarray, factors: np.ndarray,
     spring: StiffnessAxis | None = None, confirm: bool = False, progress: Progress | None = None,
 ) -> TeleopFindings:  # fmt: skip
-    """Analyse structures and, if requested, check the results by simulation.
+    """Analyse several control structures of a case and, if requested, check them by simulation.
 
     Args:
         name: name of the case.
@@ -514,10 +546,10 @@ def analyse_structures(
 
 
 def describe_stability(analysis: StructureAnalysis, released: bool = False) -> str:
-    """Return a short text on the stability of a structure and its unstable poles.
+    """Return a short text that states whether a structure is stable, with its unstable poles.
 
     Args:
-        analysis: the analysis.
+        analysis: results of the linear analysis of the structure.
         released: whether to describe the released handle instead of the held one.
 
     Returns:
@@ -536,7 +568,7 @@ def describe_stability(analysis: StructureAnalysis, released: bool = False) -> s
 
 
 def format_factor(margin: float) -> str:
-    """Format a gain margin; an infinite one as more than the largest tested factor.
+    """Format a gain margin as a factor; an infinite one as more than the largest tested factor.
 
     >>> format_factor(0.17), format_factor(math.inf)
     ('x 0.17', '> x 1000')
@@ -545,7 +577,7 @@ def format_factor(margin: float) -> str:
 
 
 def format_delay(delay: float) -> str:
-    """Format a delay; an infinite one as more than the largest tested delay.
+    """Format a maximum stable delay [s]; an infinite one as more than the largest tested delay.
 
     >>> format_delay(0.12345), format_delay(math.inf)
     ('123 ms', '> 10 s')
@@ -554,7 +586,7 @@ def format_delay(delay: float) -> str:
 
 
 def format_number(value: float) -> str:
-    """Format a number with five digits, without an exponent.
+    """Format a number with five significant digits, without an exponent.
 
     >>> format_number(-20026.0), format_number(0.0123456)
     ('-20026', '0.012346')
@@ -563,7 +595,7 @@ def format_number(value: float) -> str:
 
 
 def format_error(error: float | None) -> str:
-    """Format a relative error.
+    """Format a relative error in per cent; `not measurable` for None.
 
     >>> format_error(0.0016), format_error(1e-7)
     ('0.16 %', '< 0.01 %')
@@ -574,13 +606,15 @@ def format_error(error: float | None) -> str:
 
 
 def findings_to_dict(found: TeleopFindings) -> dict:
-    """Convert the results to plain data; infinite if no tested value changes stability.
+    """Convert the results of a case file to a dictionary for JSON.
+
+    Margins are infinite if no tested value changes stability.
 
     Args:
         found: results of the analysis.
 
     Returns:
-        A dictionary; complex numbers are pairs of real and imaginary part.
+        A dictionary in SI units; complex numbers are pairs of real and imaginary part.
     """
     case = found.case
     document = {
@@ -684,7 +718,9 @@ def _sweep_to_dict(one: SineSweep) -> dict:
 
 
 def deadband_gain(deadband: float, amplitude: float) -> float:
-    """Return the gain of a dead band for a centred sine, relative to its slope outside the band.
+    """Return the describing function of a dead band: its gain for a centred sine.
+
+    The gain is relative to the slope outside the band.
 
     A loop that is unstable with the full slope still comes to rest inside the dead band. It can
     sustain an oscillation at which this factor reduces the loop gain to the stability limit.
@@ -738,21 +774,23 @@ _CONTINUATION_STEPS, _NEWTON_STEPS = 80, 8
 
 @dataclass(frozen=True)
 class LoopFindings:
-    """Results of the analysis of one structure of a scenario.
+    """Stability results of the linear loop of a scenario with one control structure.
 
-    structure: name of the structure.
-    is_scenario_structure: whether it is the scenario's structure; otherwise direct force reflection replaces it.
-    unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
-        axis.
-    gain_margin: factor on the return channels up to which the loop is stable.
-    max_delay: maximum delay in each direction [s].
-    frequency: frequency of the oscillation at the margin [Hz]; NaN without a margin.
-    pole: pole of that oscillation at the present gain [rad/s]; NaN without a margin.
-    max_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
-        reflected.
-    hand_force: hand force at the machine's force limit with that ratio [N], [N m].
-    max_ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to stop,
-        with the reduced gain of the dead band [N/N]; NaN without a dead band.
+    Attributes:
+        structure: name of the structure.
+        is_scenario_structure: whether it is the scenario's structure; otherwise direct force
+            reflection replaces it.
+        unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
+            axis.
+        gain_margin: factor on the return channels up to which the loop is stable.
+        max_delay: maximum stable delay in each direction [s].
+        frequency: frequency of the oscillation at the margin [Hz]; NaN without a margin.
+        pole: pole of that oscillation at the present gain [rad/s]; NaN without a margin.
+        max_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
+            reflected.
+        hand_force: hand force at the machine's force limit with that ratio [N], [N m].
+        max_ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to
+            stop, with the reduced gain of the dead band [N/N]; NaN without a dead band.
     """
 
     structure: str
@@ -774,7 +812,7 @@ class LoopFindings:
 
 @dataclass(frozen=True)
 class ScenarioFindings:
-    """Results of the analysis of a scenario.
+    """Results of the linear stability analysis of a teleoperated scenario.
 
     Attributes:
         name: name of the scenario.
@@ -796,18 +834,18 @@ class ScenarioFindings:
 
 
 def analyse_scenario_case(name: str, case: LinearCase, task_source: str) -> ScenarioFindings:
-    """Analyse the linear case of a scenario.
+    """Analyse the stability of a teleoperated scenario from its linear model.
 
     Args:
         name: name of the scenario.
-        case: linear case of the scenario.
-        task_source: source of the task's parameters.
+        case: linear model of hand, joystick, machine and task along one coordinate.
+        task_source: text that states where the task's parameters come from.
 
     Returns:
-        Results of the analysis.
+        Stability of the loop, and of the joystick axis under stiffness feedback.
 
     Raises:
-        InputError: the structure has no linear case.
+        InputError: the force reflection of the scenario has no linear model.
 
     Source: Zhu 1994, chapters 3 and 4.
     """
@@ -826,7 +864,12 @@ def analyse_scenario_case(name: str, case: LinearCase, task_source: str) -> Scen
 
 
 def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structure: bool = True) -> LoopFindings:
-    """Analyse one structure of a case; see `LoopFindings`.
+    """Compute poles, margins and the largest stable reflection ratio of a scenario's linear loop.
+
+    Args:
+        case: linear model of hand, joystick, machine and task.
+        structure: control structure, one of `linear_case.STRUCTURES`.
+        is_scenario_structure: whether the scenario uses this structure; it is only recorded.
 
     Raises:
         InputError: the structure is not known.
@@ -851,7 +894,11 @@ def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structur
 
 
 def _find_oscillation(case: LinearCase, structure: str, margin: float) -> tuple[float, complex]:
-    """Return the oscillation frequency at the margin [Hz], and its pole at the present gain."""
+    """Return the oscillation frequency at the stability limit, and its pole at the present gain.
+
+    The pole is followed from the gain at the limit, `margin` times the present one, by Newton's
+    method. Return frequency [Hz] and pole [rad/s]; both are NaN without a finite margin.
+    """
     if not 0.0 < margin < math.inf:
         return math.nan, complex(math.nan, math.nan)
 
@@ -870,7 +917,9 @@ def _find_oscillation(case: LinearCase, structure: str, margin: float) -> tuple[
 
 
 def scenario_findings_to_dict(found: ScenarioFindings) -> dict:
-    """Convert the results to plain data in SI units; missing values are infinite or NaN.
+    """Convert the results of a scenario's analysis to a dictionary for JSON, in SI units.
+
+    Values that do not exist are infinite or NaN.
 
     Args:
         found: results of the analysis.

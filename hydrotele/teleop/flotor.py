@@ -37,14 +37,16 @@ _DIFFERENCE_ERROR = 1e-3  # relative error of difference quotients at 6 Hz: (w d
 
 @dataclass(frozen=True)
 class FlotorFit:
-    """Ten identified parameters in the coils' frame, in the order of NAMES.
+    """Identified mass, centre of mass and inertia of the flotor, with their uncertainty.
+
+    The coils' frame is used; `FLOTOR_PARAMETERS` gives names and order of the ten parameters.
 
     Attributes:
         value: (10,) mass [kg], centre of mass [m], inertia about it [kg m^2].
         interval_half_width: (10,) half widths of the 95 % confidence intervals.
         residual: (6,) root mean square residuals of force [N] and torque [N m].
         condition: condition number of the scaled equations.
-        sample_count: number of samples.
+        sample_count: number of samples in the fit.
     """
 
     value: np.ndarray
@@ -54,7 +56,7 @@ class FlotorFit:
     sample_count: int
 
     def to_flotor(self) -> Flotor:
-        """Return the identified body for use in the control.
+        """Convert the identified parameters to the flotor model that the control uses.
 
         Raises:
             InputError: the parameters are not physical.
@@ -66,20 +68,22 @@ def identify_flotor(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils,
     cutoff: float = _CUTOFF,
 ) -> FlotorFit:  # fmt: skip
-    """Identify the flotor's parameters by least squares from a motion that excites all axes.
+    """Identify mass, centre of mass and inertia of the flotor by least squares.
+
+    The recorded motion must excite all axes.
 
     Args:
         place: (n, 3) position of the coils' frame [m].
         quaternion: (n, 4) orientation of the frame, scalar first.
-        currents: (n, 6) held from each sample until the next [A].
+        currents: (n, 6) coil currents, held from each sample until the next [A].
         period: sampling period [s].
         coils: coils; their map and position define frame and wrench.
-        cutoff: cutoff frequency of the filter [Hz].
+        cutoff: cutoff frequency of the low-pass filter of motion and wrench [Hz].
 
     Returns:
-        The fit. Its intervals include correlated noise and the error of difference quotients
-        (1e-3 of the flotor's size, 1e-6 of its mass, which gravity determines). They do not
-        include errors of the coils' map.
+        The fit. Its confidence intervals include correlated noise and the error of difference
+        quotients (1e-3 of the flotor's radius of gyration, 1e-6 of its mass). They do not include
+        errors of the coils' map.
 
     Raises:
         InputError: the record is too short, has invalid samples, or its motion does not make all
@@ -114,7 +118,7 @@ def identify_flotor(
 def flotor_equations(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Build the Newton-Euler regression of a body under piecewise constant wrenches.
+    """Build the linear equations of motion of the flotor, `regressor @ parameters = wrench`.
 
     The wrench is constant between samples. A second difference of positions is therefore the mean
     of the accelerations before and after a sample, and is paired with the mean of the two wrenches.
@@ -122,15 +126,16 @@ def flotor_equations(
     Args:
         place: (n, 3) position of the coils' frame [m].
         quaternion: (n, 4) scalar first.
-        currents: (n, 6) [A].
+        currents: (n, 6) coil currents, held until the next sample [A].
         period: sampling period [s].
         coils: the coils.
 
     Returns:
-        Regressor (n - 2, 6, 10) of mass, first moments [kg m] and inertia about the coils' frame
-        [kg m^2] (xx, yy, zz, xy, xz, yz), and wrench (n - 2, 6) [N], [N m].
+        Regressor (n - 2, 6, 10) of mass [kg], first moments of mass [kg m] and inertia about the
+        origin of the coils' frame [kg m^2] (xx, yy, zz, xy, xz, yz), and wrench (n - 2, 6) of the
+        coils [N], [N m].
 
-    Source: see `identify_flotor`.
+    Source: Newton and Euler; Atkeson, An and Hollerbach 1986 (linear in ten parameters).
     """
     pairs = zip(quaternion[:-1], quaternion[1:], strict=True)
     between = np.array([_relative_rotation(a, b) for a, b in pairs]) / period
@@ -150,7 +155,10 @@ def flotor_equations(
 
 
 def _difference_errors(value: np.ndarray) -> np.ndarray:
-    """Return the errors (10,) of difference quotients, for tones up to 6 Hz at 200 Hz."""
+    """Return the errors (10,) of the parameters due to derivatives by difference quotients.
+
+    They hold for motions up to 6 Hz that are sampled at 200 Hz.
+    """
     moment = value[4:7].sum() / 2.0
     radius = float(np.sqrt(moment / value[0]))
     return _DIFFERENCE_ERROR * np.array([1e-3 * value[0], *[radius] * 3, *[moment] * 6])
@@ -164,7 +172,7 @@ def _relative_rotation(first: np.ndarray, then: np.ndarray) -> np.ndarray:
 
 
 def _skew_matrices(v: np.ndarray) -> np.ndarray:
-    """Return the matrices (n, 3, 3) of the cross products of v (n, 3)."""
+    """Return the skew-symmetric matrices (n, 3, 3) that multiply u to give `v x u`, for v (n, 3)."""
     out = np.zeros((len(v), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, k, j], out[:, j, k] = v[:, i], -v[:, i]
@@ -172,7 +180,10 @@ def _skew_matrices(v: np.ndarray) -> np.ndarray:
 
 
 def _inertia_regressor(v: np.ndarray) -> np.ndarray:
-    """Return (n, 3, 6) that maps xx, yy, zz, xy, xz, yz to the inertia times v (n, 3)."""
+    """Return matrices (n, 3, 6) that multiply xx, yy, zz, xy, xz, yz of an inertia I to give I v.
+
+    v (n, 3) are the vectors.
+    """
     out = np.zeros((len(v), 3, 6))
     for row, places in enumerate(_INERTIA_INDICES):
         for column, place in enumerate(places):
@@ -185,9 +196,10 @@ def _inertia_matrix(six: np.ndarray) -> np.ndarray:
 
 
 def _move_to_centre_of_mass(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Move first moments and inertia from the coils' frame to the centre of mass.
+    """Convert mass, first moments and inertia about the coils' frame to those about the mass centre.
 
-    Return the parameters (10,) and their Jacobian (10, 10), by central differences.
+    Return the parameters (10,) mass, centre of mass and inertia about it, and their Jacobian (10, 10)
+    with respect to the given ones, by central differences.
     """
 
     def convert(p: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Simulation of a stand-alone levitated joystick: sensing, control and flotor in one loop.
 
-The flotor hovers, follows steps and excitation paths without a hand. Tests and identification use
-the sensed poses and the coil currents.
+The flotor is the moving part with handle and coils. It hovers, follows steps and excitation paths
+without a hand. Tests and identification use the sensed poses and the coil currents.
 
 The control converts a sensed pose to coil currents once per period. Every axis is a designed
 second-order system about a remote centre of compliance at the handle. With a hand on the handle,
@@ -39,11 +39,11 @@ _ZERO_CURRENTS = np.zeros(6)
 
 @dataclass(frozen=True)
 class LevitationControl:
-    """Parameters of the control.
+    """Parameters of the controller that levitates the flotor.
 
     Attributes:
         flotor_model: model of the flotor in the control, in the coils' frame.
-        axes: designed second-order systems.
+        axes: designed second-order responses of the six axes.
         coils: the coils.
         handle: (3,) centre of compliance in the coils' frame [m].
         period: control period [s].
@@ -59,7 +59,7 @@ class LevitationControl:
 
 
 class ControllerState(NamedTuple):
-    """State of the control between periods.
+    """State that the levitation controller keeps from one period to the next.
 
     Attributes:
         place: (3,) last measured position of the coils' frame [m]; NaN if there was none.
@@ -73,10 +73,10 @@ class ControllerState(NamedTuple):
 
 
 class CoilOutput(NamedTuple):
-    """Output of the control to the coils.
+    """Output of the levitation controller in one period.
 
     Attributes:
-        currents: (6,) [A].
+        currents: (6,) coil currents [A].
         is_limited: whether the currents were scaled down.
         is_blind: whether the coils are off because the reading is not finite or is frozen.
     """
@@ -89,7 +89,7 @@ class CoilOutput(NamedTuple):
 def make_levitation_control(
     joystick: Joystick, body: Flotor | None = None, max_frozen_time: float = MAX_FROZEN_TIME
 ) -> LevitationControl:
-    """Build the control parameters of a joystick.
+    """Build the parameters of the levitation controller from a joystick's file.
 
     Args:
         joystick: the joystick.
@@ -115,7 +115,7 @@ def make_levitation_control(
 
 
 def initial_controller_state() -> ControllerState:
-    """Return the state of the control before its first reading."""
+    """Return the state of the levitation controller before its first reading: NaN pose, no time."""
     return ControllerState(np.full(3, np.nan), np.full(4, np.nan), 0.0)
 
 
@@ -123,7 +123,9 @@ def step_levitation(
     control: LevitationControl, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
     target: np.ndarray, target_rotation: np.ndarray,
 ) -> tuple[ControllerState, CoilOutput]:  # fmt: skip
-    """Run one control period: velocities by differences, wrench, currents.
+    """Run one period of the levitation controller: convert a measured pose to coil currents.
+
+    Velocities are differences of successive poses.
 
     A reading that is not finite, or is constant for longer than noise permits, switches the coils
     off, so that an unmeasured pose causes no force. The flotor then sinks onto its stops. With
@@ -159,12 +161,12 @@ def step_levitation(
 
 
 def coil_frame_position(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Return the position of the coils' frame (3,) [m] from the pose of the handle.
+    """Return the position of the coils' frame (3,) [m] for a pose of the handle.
 
     Args:
         handle: (3,) the handle's point in the coils' frame [m].
-        place: (3,) position of the handle [m].
-        quaternion: (4,) orientation, scalar first.
+        place: (3,) position of the handle, world axes [m].
+        quaternion: (4,) orientation of the flotor, scalar first.
     """
     turn = np.empty((3, 3))
     quaternion_to_matrix(quaternion, turn)
@@ -183,7 +185,7 @@ _VERTICAL_DIRECTION = np.array([0.0, 0.0, 1.0])
 
 
 def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
-    """Return the positions at which the beams meet the diodes.
+    """Return the positions at which the flotor's three light beams meet the diodes of the stator.
 
     Args:
         place: (3,) displacement of the flotor's centre from its nominal position [m].
@@ -191,7 +193,7 @@ def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.n
         distance: distance of the diodes from the centre [m].
 
     Returns:
-        (6,) readings: lateral and vertical position on each diode in turn [m].
+        (6,) readings: lateral and vertical position on the first, second and third diode [m].
 
     Raises:
         InputError: a beam does not reach its diode's side.
@@ -207,10 +209,10 @@ def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.n
 
 
 def solve_flotor_pose(readings: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the flotor's pose from the six readings, by Newton's method from the centre.
+    """Compute the flotor's pose from the six diode readings, by Newton's method from the centre.
 
     Args:
-        readings: (6,) see `diode_readings` [m].
+        readings: (6,) lateral and vertical position on each of the three diodes [m].
         distance: distance of the diodes from the centre [m].
 
     Returns:
@@ -220,7 +222,7 @@ def solve_flotor_pose(readings: np.ndarray, distance: float) -> tuple[np.ndarray
     Raises:
         InputError: no pose corresponds to these readings.
 
-    Source: `diode_readings`; Newton.
+    Source: inverse of `diode_readings` by Newton's method.
     """
     place, turn = np.zeros(3), np.eye(3)
     if not np.isfinite(readings).all():
@@ -235,7 +237,9 @@ def solve_flotor_pose(readings: np.ndarray, distance: float) -> tuple[np.ndarray
 
 
 def pose_resolution(distance: float, step: float) -> np.ndarray:
-    """Return the pose uncertainty at the centre that results from the diodes' resolution.
+    """Return the standard deviations of a pose measured with diodes of finite resolution.
+
+    They hold for a flotor at its centre.
 
     Args:
         distance: distance of the diodes from the centre [m].
@@ -253,7 +257,10 @@ def pose_resolution(distance: float, step: float) -> np.ndarray:
 
 
 def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
-    """Return readings (6,) and Jacobian (6, 6) by position and a small rotation of the stator."""
+    """Return the diode readings (6,) [m] of a pose, and their Jacobian (6, 6).
+
+    The Jacobian's columns are the position and a small rotation about the stator's axes.
+    """
     readings, slope = np.empty(6), np.empty((6, 6))
     for k, (out, aside) in enumerate(zip(_BEAM_DIRECTIONS, _LATERAL_DIRECTIONS, strict=True)):
         beam = turn @ out
@@ -272,7 +279,7 @@ def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """Convert a rotation vector to a rotation matrix."""
+    """Convert a rotation vector (3,) [rad] to a rotation matrix (3, 3) by Rodrigues' formula."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / angle if angle > 0.0 else vector
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -286,7 +293,7 @@ _TONES_PER_AXIS = 6
 
 @dataclass(frozen=True)
 class LevitationRun:
-    """Time histories of a run, one row per control period.
+    """Time histories of a simulated run of the levitated joystick, one row per control period.
 
     Attributes:
         time: (n,) [s].
@@ -310,7 +317,7 @@ class LevitationRun:
 
 
 class PoseSensor:
-    """Measure the flotor's pose with the resolution and noise of its sensors.
+    """Simulated sensor of the flotor's pose, with resolution and noise.
 
     By default the position of the handle and the rotation vector are rounded to the resolution, as
     in `teleop.master`. With diodes, the three beams are traced instead.
@@ -322,7 +329,7 @@ class PoseSensor:
         Args:
             joystick: the joystick.
             noise: maximum error before rounding, in steps of the resolution.
-            diodes: whether to trace the beams.
+            diodes: whether to simulate the diodes instead of rounding the pose.
             seed: seed of the noise.
         """
         self._noise, self._rng = noise, np.random.default_rng(seed)
@@ -334,7 +341,15 @@ class PoseSensor:
             self._step = np.full(6, joystick.diodes.step)
 
     def read(self, qpos: np.ndarray) -> PoseReading:
-        """Return position (3,) [m] from the handle's centre and quaternion (4,) of the coils."""
+        """Measure the pose of the coils' frame.
+
+        Args:
+            qpos: (7,) true position of the handle [m] and orientation quaternion, scalar first.
+
+        Returns:
+            Measured position (3,) of the coils' frame, from the handle's centre [m], and quaternion
+            (4,), scalar first.
+        """
         if self._distance:
             turn = np.empty((3, 3))
             quaternion_to_matrix(qpos[3:7], turn)
@@ -363,17 +378,19 @@ def simulate_levitation(
     cab_motion: tuple[np.ndarray, np.ndarray] | None = None, handle_wrench: np.ndarray | None = None,
     sensor_fault: Callable[[int, PoseReading], PoseReading] | None = None,
 ) -> LevitationRun:  # fmt: skip
-    """Simulate the levitated flotor along a reference path.
+    """Simulate a levitated joystick that follows a reference path, with sensing and control.
 
     Args:
         joystick: the joystick.
-        target: (n, 6) reference of the handle [m], rotation vector [rad], per control period.
+        target: (n, 6) reference position of the handle [m] and rotation vector [rad] in every control
+            period.
         control: the control; the joystick's own by default.
         start: (6,) initial pose at rest [m], [rad]; the centre by default.
         noise: maximum error of a reading before rounding, in steps of the resolution.
         diodes: whether the three diodes measure the pose, instead of rounding it.
         seed: seed of the noise.
-        cab_motion: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab.
+        cab_motion: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab
+            about its swing axis; a fixed mount if omitted.
         handle_wrench: (n, 6) forces [N] and torques [N m] on the handle.
         sensor_fault: function that applies a sensor fault to the reading of a period.
 
@@ -417,7 +434,9 @@ def simulate_levitation(
 def make_excitation_path(
     joystick: Joystick, seconds: float, seed: int = 0, workspace_fraction: float = 0.5
 ) -> np.ndarray:
-    """Generate an identification path: every axis with its own tones between 0.4 and 6 Hz.
+    """Generate a path that excites all six axes, for the identification of the flotor.
+
+    Every axis is a sum of tones, different for each axis, between 0.4 and 6 Hz.
 
     Args:
         joystick: the joystick.
@@ -450,7 +469,7 @@ def second_order_step_response(time: np.ndarray, frequency: float, ratio: float)
         ratio: damping ratio, below 1.
 
     Returns:
-        (n,) from 0 to 1.
+        (n,) response, which rises from 0 and settles at 1.
 
     >>> import numpy as np
     >>> second_order_step_response(np.array([0.0, 10.0]), 25.0, 0.8).round(6).tolist()

@@ -1,11 +1,13 @@
 """Linear model of one axis of a teleoperated scenario, built from its simulation parameters.
 
-Hand and flotor are `(M_m + M_h) s + B_h + K_h / s`. The coils add spring and damper of the
+Hand (h) and flotor (m), the moving part of the joystick, have the impedance
+`(M_m + M_h) s + B_h + K_h / s` with masses M, damper B and spring K. The coils add spring and damper of the
 scenario's gains, sampled: a control period T holds them for T / 2 on average, and the damper's
 difference quotient adds another T / 2. An operator who answers a directly reflected force with a
 force does not control the position: the spring of the arm follows the handle,
 `K_h (1 - exp(-s t)) / s`, with t the reflex time and half a decision period. Under rate control the
-handle beyond its dead band commands `k_v x`, so that the tip follows `k_v V_h / s`. Under position
+handle displacement x beyond the dead band commands the tip rate `k_v x`, so that the tip follows
+`k_v V_h / s` with the handle's velocity V_h. Under position
 control the tip follows the filtered position. The force at the tip returns through the estimator's
 two filters, a hold of one sensor sample and the channel's delay, multiplied by the ratio.
 
@@ -13,12 +15,16 @@ Neglected: dead bands, stops, limits of force and acceleration, loss of contact,
 the other axes of the handle, which are at rest.
 
 The valve-controlled machine is linearised at its tip along one task coordinate about a pose.
-Oil is a spring: at held valves a drive's force changes by `K (v_valve - v)` per second, with
-`K = beta (A_h^2 / V_A + A_r^2 / V_B)` and the velocity v_valve that the valve flow produces. The
-servo commands `v_ref + g (y_ref - y) - p (F - mean F) / K` (`control.servo`), which the valve
-follows with its lag V. For one joint this is
+Oil is a spring: at held valves a drive's force F changes by `K (v_valve - v)` per second, with
+`K = beta (A_h^2 / V_A + A_r^2 / V_B)` (bulk modulus beta, piston areas A and chamber volumes V_A, V_B)
+and the velocity v_valve that the valve flow produces. The servo commands
+`v_ref + g (y_ref - y) - p (F - mean F) / K` (`control.servo`) with the reference position y_ref and
+velocity v_ref, the position gain g and the pressure feedback p. The valve follows with its lag V. For
+one joint this is
 
     F = K / (s + p V L) [(V + g V / s) v_ref - (1 + g V / s) v],   L = T s / (T s + 1)
+
+with the averaging time T of the drive's force.
 
 The arm adds the compliances of its joints at the tip, each with its own lag: `1 / C_s` is the sum
 of `J_i^2 / C_i`, and the tip follows its reference by the mean of the joints' `(V + g V / s) /
@@ -76,9 +82,12 @@ class TipModel:
 
     Attributes:
         coordinate: `r`, `theta`, `z`, `attitude` or `head`.
-        mass: effective mass, `1 / (J M^-1 J')` [kg], [kg m^2].
-        compliance: (k,) of every joint at the tip, with closed valves [m/N], [rad/(N m)].
-        rate_fractions: (k,) contribution of every joint to the reference rate; their sum is 1.
+        mass: effective mass `1 / (J M^-1 J')` with the Jacobian row J of the coordinate and the mass
+            matrix M of the joints [kg], [kg m^2].
+        compliance: (k,) compliance at the tip due to the oil of each joint's drive, with closed valves
+            [m/N], [rad/(N m)].
+        rate_fractions: (k,) fraction of the tip's reference rate that each joint contributes; their
+            sum is 1.
         gain: (k,) servo gains g [1/s].
         bandwidth: (k,) bandwidths of the valves [rad/s].
         damping: (k,) damping ratios of the valves [1].
@@ -96,7 +105,7 @@ class TipModel:
 
     @property
     def stiffness(self) -> float:
-        """Hydraulic stiffness at the tip with closed valves [N/m], [N m/rad]."""
+        """Stiffness of the oil at the tip along the coordinate, with closed valves [N/m], [N m/rad]."""
         return 1.0 / float(self.compliance.sum())
 
 
@@ -109,11 +118,11 @@ class SamplingPeriods:
 
 
 def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, servo: Servo) -> TipModel:
-    """Linearise the tip of a machine along one coordinate.
+    """Build the linear model of a machine's tip along one task coordinate, about a pose.
 
     Args:
         machine: machine with valve-controlled drives in all joints of its arm.
-        joints: axis -> position of the pose [rad]; the other axes are at their home position.
+        joints: axis -> joint position [rad]; the other axes are at their home position.
         coordinate: task coordinate of the arm.
         servo: gains of the servo.
 
@@ -122,7 +131,7 @@ def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, s
 
     Raises:
         InputError: the arm has no tip force model, or does not move along the coordinate in this
-        pose.
+            pose.
 
     Source: this module's docstring; effective mass after Khatib 1987.
     """
@@ -145,7 +154,16 @@ def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, s
 
 
 def _effective_mass(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return effective mass, Jacobian row (k,), and joint rates (k,) per unit coordinate rate."""
+    """Compute the effective mass of the tip along a task coordinate, and the joints' lever arms.
+
+    Args:
+        arm: model of the arm in the pose `arm.z`.
+        row: number of the task coordinate.
+
+    Returns:
+        Effective mass [kg] or [kg m^2], Jacobian row (k,) of the coordinate by the joint angles, and
+        joint rates (k,) that move the coordinate at unit rate and keep the others constant.
+    """
     motion, k = arm.space.motion, len(arm.joint)
     place_mechanism(arm.model, arm.space, arm.z)
     compute_mass_and_bias(arm.model.mech, motion)
@@ -159,10 +177,10 @@ def _effective_mass(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.nd
 
 
 def _joint_stiffness(arm: ArmBalance, valve: int) -> float:
-    """Return the stiffness of a joint due to its drive's oil [N m/rad], after `place_mechanism`.
+    """Return the stiffness of a joint due to the oil in its drive's chambers [N m/rad].
 
-    Air content is neglected: it lowers the stiffness in a way that depends on the unknown
-    pressures.
+    The pose is that of the last `place_mechanism`. Air content is neglected: it lowers the stiffness
+    in a way that depends on the unknown pressures.
     """
     user = arm.model.user[valve * SLOT_COUNT : (valve + 1) * SLOT_COUNT]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
@@ -177,7 +195,9 @@ def _joint_stiffness(arm: ArmBalance, valve: int) -> float:
 
 
 def tip_controller_impedance(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray) -> np.ndarray:
-    """Return C_s: force at the tip per velocity error of the tip.
+    """Return the servo's impedance at the tip: force per velocity error of the tip.
+
+    This is C_s of the module's docstring, with oil, valves, servo and sensor sampling.
 
     Args:
         tip: linear tip model.
@@ -196,7 +216,7 @@ def tip_controller_impedance(tip: TipModel, servo: Servo, clocks: SamplingPeriod
 
 
 def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray) -> np.ndarray:
-    """Return the velocity of the unloaded tip per reference velocity.
+    """Return the frequency response of the unloaded tip: its velocity per reference velocity.
 
     Args:
         tip: linear tip model.
@@ -217,7 +237,11 @@ def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, 
 
 
 def _drive_lags(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
-    """Return (..., k) valves with delay, hold of the sensors, and pressure feedback [1/s]."""
+    """Return three frequency responses (..., k) of the k drives at complex frequencies s (...).
+
+    They are valve velocity per command, with the command's delay [1]; the delay of half a sensor
+    sample [1]; and the pressure feedback p V L of the module's docstring [1/s].
+    """
     at = s[..., None]
     valve = tip.bandwidth**2 / (at**2 + 2.0 * tip.damping * tip.bandwidth * at + tip.bandwidth**2)
     valve = valve * np.exp(-tip.delay * at)
@@ -233,11 +257,14 @@ STRUCTURES = ("rate_force", "position_force", "rate_position", "position_positio
 
 @dataclass(frozen=True)
 class LinearCase:
-    """Linear loop of one axis with hand, machine and task; usable like `teleop.analysis.Case`.
+    """Linear loop of one axis with hand, joystick, machine and task.
+
+    It provides `task`, `hand`, `with_delay` and `make_port`, so that the functions of
+    `teleop.analysis` can analyse it.
 
     Attributes:
         pilot: teleoperation settings of the scenario.
-        axis_parameters: (17,) parameters of the joystick axis, see `teleop.master.Master.axis`.
+        axis_parameters: (18,) parameters of the joystick axis, a row of `build_axis_table`.
         master: mass of the flotor [kg] or its moment of inertia about the handle [kg m^2].
         hand_impedance: mass, damper and spring of the hand.
         tip: linear tip model of the machine.
@@ -266,7 +293,7 @@ class LinearCase:
 
     @property
     def force_limit(self) -> float:
-        """Machine force at which the reflected force saturates [N], [N m]."""
+        """Machine force at which the reflected force stops to increase [N], [N m]."""
         return float(self.axis_parameters[MAX_REFLECTED_FORCE])
 
     @property
@@ -281,7 +308,7 @@ class LinearCase:
 
     @property
     def spring(self) -> StiffnessAxis:
-        """Joystick axis under stiffness feedback, without the hand."""
+        """Mass, damping and stiffness range of the joystick axis under stiffness feedback, no hand."""
         r = self.axis_parameters
         return StiffnessAxis(
             self.master.mass,
@@ -293,16 +320,22 @@ class LinearCase:
 
     @property
     def has_force_control(self) -> bool:
-        """Whether the operator controls the force, not the position, under direct reflection."""
+        """Whether the simulated operator controls a contact force instead of a position.
+
+        This is the case for operators with a force target, except with a coordinating force.
+        """
         pressing = isinstance(self.pilot.operator, RegulateForce | TrackForce)
         return pressing and self.pilot.reflection != "coordinating_force"
 
     def with_delay(self, delay: float) -> "LinearCase":
-        """Return the case with a delay [s] in each direction."""
+        """Return a copy of the case with the same delay [s] in each direction."""
         return replace(self, delay_forward=delay, delay_back=delay)
 
     def hand(self, s: np.ndarray) -> np.ndarray:
-        """Return the hand's impedance [N s/m], [N m s/rad] at complex frequencies [rad/s]."""
+        """Return the hand's impedance [N s/m], [N m s/rad] at complex frequencies [rad/s].
+
+        The spring of an operator who controls a force follows the handle after the reflex delay.
+        """
         if not self.has_force_control:
             return self.hand_impedance(s)
         late = REFLEX_DELAY + 0.5 / DECISION_RATE + 0.5 * self.periods.control_period
@@ -310,7 +343,7 @@ class LinearCase:
         return self.hand_impedance(s) - own
 
     def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """Return the two-port of a structure with the parameters of this case.
+        """Return the linear two-port of joystick and machine with a given control structure.
 
         Args:
             structure: `rate_force`, `position_force`, `rate_position` or `position_position`.
@@ -361,29 +394,37 @@ class LinearCase:
         )  # fmt: skip
 
     def _commanded_velocity(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Return the commanded tip velocity per velocity of the handle."""
+        """Return the commanded tip velocity per velocity of the handle, as a frequency response."""
         if rate:
             return self.axis_parameters[GAIN] / s
         return self.axis_parameters[GAIN] * (SMOOTHING_BANDWIDTH / (s + SMOOTHING_BANDWIDTH)) ** 2
 
     def _centring_impedance(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Return the sampled spring and damper of the coils; no spring under position control."""
+        """Return the impedance of the coils' spring to the centre and damper, with sampling delays.
+
+        Under position control (`rate` false) there is no spring.
+        """
         held = np.exp(-0.5 * self.periods.control_period * s)
         return held * (
             (self.axis_parameters[NOMINAL_STIFFNESS] if rate else 0.0) / s + self.axis_parameters[DAMPING] * held
         )
 
     def _coupling_impedance(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
-        """Return the coordinating force on the hand per velocity difference of the machine.
+        """Return the force on the hand per velocity error of the machine, with coordinating force.
 
-        The force is held for `period`; by default for the sum of the control and the sensor period.
+        The spring and damper of the coupling act on the difference between commanded and actual tip
+        position. The force is held for `period` [s]; by default for the sum of the control and the
+        sensor period.
         """
         scale = 1.0 if rate else 1.0 / self.axis_parameters[GAIN]
         held = np.exp(-0.5 * (period or self.periods.control_period + self.periods.sensor_period) * s)
         return scale * held * (self.axis_parameters[COUPLING] / s + self.axis_parameters[COUPLING_DAMPING])
 
     def _reflected_force_response(self, s: np.ndarray) -> np.ndarray:
-        """Return the reflected force per task force: filters, sensor sample, and control period."""
+        """Return the reflected force before scaling per contact force, as a frequency response [1].
+
+        It has the delays of sensor sample and control period, and the two filters of the estimator.
+        """
         held = np.exp(-0.5 * self.periods.control_period * s)
         if self.pilot.force == "true":
             return held
@@ -396,7 +437,7 @@ def build_linear_case(
     pilot: TeleopPilot, joystick: Joystick, numbers: MasterParameters, tip: TipModel, servo: Servo,
     clocks: SamplingPeriods, task: Impedance,
 ) -> LinearCase:  # fmt: skip
-    """Build the linear case of one coordinate.
+    """Build the linear loop of one task coordinate from joystick, machine and environment.
 
     Args:
         pilot: teleoperation settings of the scenario.
@@ -427,16 +468,16 @@ def build_linear_case(
 
 
 def stiffness_feedback_ratio(case: LinearCase, displacement: float) -> float:
-    """Return the reflection ratio of stiffness feedback for small force changes.
+    """Return the change of hand force per change of machine force under stiffness feedback.
 
     Args:
-        case: the case.
+        case: linear case with the parameters of the joystick axis.
         displacement: constant displacement of the handle, scalar [m], [rad].
 
     Returns:
         `K_r |x|`, hand force per machine force [N/N]; K_r is the stiffness per force.
 
-    Source: derivative of `K(f) x` by f; Zhu 1994, 4.1.
+    Source: derivative by the machine force f of the hand force `K(f) x`; Zhu 1994, 4.1.
     """
     spring = case.spring
     return (
@@ -452,12 +493,12 @@ _POSITION_INDEX = {"z": 2, "r": 0}
 
 
 class Contact(NamedTuple):
-    """Contact pose and impedance of the environment.
+    """Pose of the arm at which it touches the environment, and the environment's impedance.
 
     Attributes:
-        joints: axis -> position [rad].
-        task: impedance along the coordinate.
-        source: source of the impedance.
+        joints: axis -> joint position [rad].
+        task: impedance of the environment along the coordinate.
+        source: text that states where the impedance comes from.
     """
 
     joints: dict[str, float]
@@ -468,7 +509,7 @@ class Contact(NamedTuple):
 def build_scenario_case(
     scenario: Scenario, machine: Machine, joystick: Joystick, coordinate: str | None = None
 ) -> tuple[LinearCase, Contact]:
-    """Build the linear case of a scenario, with the hand of its simulated operator.
+    """Build the linear loop of a teleoperated scenario, with the hand of its simulated operator.
 
     Args:
         scenario: scenario with a teleoperated pilot.
@@ -504,7 +545,10 @@ def build_scenario_case(
 
 
 def scenario_joystick(scenario: Scenario) -> str:
-    """Return the name or file of a scenario's joystick, relative to the scenario's file."""
+    """Return the path of a scenario's own joystick file, or the name of a shipped joystick.
+
+    An own file is relative to the folder of the scenario.
+    """
     name = scenario.pilot.joystick if isinstance(scenario.pilot, TeleopPilot) else "joystick"
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
@@ -516,7 +560,10 @@ def _default_coordinate(pilot: TeleopPilot) -> str:
 
 
 def _find_contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
-    """Return the contact at the start pose, moved along the coordinate to the plate."""
+    """Return the contact with the scenario's plate, or else with stiff ground at the start pose.
+
+    For a plate, the start pose is moved along the coordinate to the plate's position.
+    """
     joints = machine.home | scenario.start.joints
     here = {name: joints.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     pose, plate = scenario.start.pose, _find_plate(scenario, coordinate)
@@ -535,7 +582,7 @@ def _find_contact(scenario: Scenario, machine: Machine, coordinate: str) -> Cont
 
 
 def _find_plate(scenario: Scenario, coordinate: str) -> Plate | None:
-    """Return the first plate whose normal is along a coordinate."""
+    """Return the scenario's first plate whose normal is along a coordinate, None without one."""
     ways = _PLATE_NORMALS.get(coordinate, ())
     for thing in scenario.surroundings:
         if isinstance(thing, Plate) and thing.normal in ways:

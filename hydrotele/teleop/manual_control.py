@@ -1,7 +1,8 @@
 """Visual manual control: the crossover model of the human operator, with online learning.
 
-Around the crossover frequency operator and controlled element together are
-`Yp Yc = omega_c e^(-tau s) / s`. The operator integrates if the element is a gain, acts in
+The controlled element Yc is what responds to the hand, such as machine and joystick together. Around
+the crossover frequency omega_c, operator Yp and controlled element together are
+`Yp Yc = omega_c e^(-tau s) / s` with an effective delay tau. The operator integrates if the element is a gain, acts in
 proportion if it integrates once, and generates lead if it integrates twice. The operator learns the
 element's gain and lag from past actions and observations. The required phase margin then gives the
 crossover frequency. The error is observed with a delay and with noise in proportion to its size
@@ -29,17 +30,20 @@ _WASHOUT_FREQUENCY = 1.5  # rad/s: slower motion is drift, not an effect of the 
 _ERROR_CORRELATION_TIME = 0.5  # s, correlation time of the prediction errors
 _VARIANCE_TIME = 5.0  # s, averaging time for the variance of the observed errors
 _MIN_POWER = 1e-24  # sum of squares below which nothing has moved
-# indices into `VisualLoop.facts`
+# indices into `VisualLoop.parameters`
 STEP, DELAY, REMNANT, THRESHOLD, MEMORY, GAIN_UNCERTAINTY, MAX_OUTPUT, FORM, EXPECTED_GAIN = range(9)
 ERROR_POWER, RATE_POWER, INTEGRAL, SELECTED_CANDIDATE, ESTIMATED_GAIN, NOTICED_ERROR = range(6)  # in `VisualLoop.state`
 
 
 class VisualLoop(NamedTuple):
-    """Parameters and state of a visually closed loop, with n candidate elements.
+    """Parameters and state of a loop that the operator closes by vision.
+
+    The operator fits n candidate models of the controlled element, which differ in lag and dead time.
 
     Attributes:
-        parameters: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
-            surprise [1], maximum output, number of integrations, expected gain.
+        parameters: (9,) decision step [s], visual delay [s], remnant [1], threshold of the error,
+            memory time [s], standard deviation of the logarithm of the expected gain, maximum
+            displacement of the hand, number of integrations of the element, expected gain.
         lag: (n,) first-order lag of each candidate [s].
         dead_time: (n,) dead time of each candidate [s].
         operator_gain: (n,) operator gain for each candidate, for an element of unit gain.
@@ -47,10 +51,11 @@ class VisualLoop(NamedTuple):
         noise: (m, 2) standard normal noise of error and rate.
         hand: (n, 4) hand displacement after each lag, and its three low-pass filters.
         output_filter: (3,) low-pass filters of the observed output.
-        sums: (n, 4) exponentially weighted sums of effect^2, effect times output, output^2, and of
-            steps.
-        state: (6,) mean square of error and rate, integral of the output, selected candidate, its
-            gain, present noise-free observed error, 0 below the threshold.
+        sums: (n, 4) exponentially weighted sums of effect^2, effect times output, output^2, and of 1;
+            the effect is the output that a candidate of unit gain predicts.
+        state: (6,) mean square of the error, mean square of its rate, integrated hand displacement,
+            number of the selected candidate, its gain, and the observed error without noise (0 below
+            the threshold).
     """
 
     parameters: np.ndarray
@@ -70,14 +75,14 @@ def make_visual_loop(
     form: int, margin: float | None = None, threshold: float = 0.0, max_output: float = math.inf,
     steps: int = 2**12,
 ) -> VisualLoop:  # fmt: skip
-    """Create a visually closed loop in its initial state.
+    """Create the parameters and initial state of a loop that an operator closes by vision.
 
     Args:
         operator: parameters of the operator.
         step: time between two decisions [s].
         expected_gain: expected gain of the element.
         rng: random generator of the observation noise and of the error of the expected gain.
-        form: known form of the element: gain, integrator or double integrator.
+        form: form of the element, known to the operator: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
         margin: required phase margin [rad]; by default the margin of tracking.
         threshold: error below which the operator does not act.
         max_output: maximum displacement of the hand.
@@ -111,7 +116,10 @@ def make_visual_loop(
 
 @inlined
 def _past_value(past, tick, back, column):
-    """Return a past value, interpolated between decisions; 0 before the first decision."""
+    """Return the value of a column of the ring buffer `past`, `back` decisions before `tick`.
+
+    A fractional `back` interpolates between decisions. The value is 0 before the first decision.
+    """
     whole = int(back)
     if tick < whole + 1:
         return 0.0
@@ -122,16 +130,18 @@ def _past_value(past, tick, back, column):
 
 @compiled
 def update_element_fits(loop, tick, late, seen):
-    """Update the fit of every candidate element with the latest hand motion and output.
+    """Update the least-squares gain of every candidate model of the controlled element.
 
-    Hand and output pass through a third-order wash-out, so that each candidate's effect is a filter
-    of the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
+    Hand and output pass through a third-order high-pass (wash-out) of bandwidth a, so that slow drift
+    does not count. A candidate with n integrations and lag T then predicts the output, for unit gain,
+    as the hand displacement filtered by `s^(3-n) / (s + a)^3 / (T s + 1)`. The best candidate is
+    selected.
 
     Args:
-        loop: Loop; `hand`, `seen`, `sums` and `state` are written.
+        loop: VisualLoop; `hand`, `output_filter`, `sums` and `state` are written.
         tick: number of the decision, scalar.
-        late: age of the observation in steps, scalar.
-        seen: output of the element at that time, scalar.
+        late: age of the observation in decision steps, scalar.
+        seen: observed output of the element at that time, scalar.
 
     Returns:
         Nothing.
@@ -174,10 +184,12 @@ def update_element_fits(loop, tick, late, seen):
 
 @compiled
 def estimate_element_gain(loop):
-    """Compute the operator's gain estimate: fitted gain, weighted with the expected gain.
+    """Estimate the gain of the controlled element: fitted gain, weighted with the expected gain.
+
+    Both are weighted by their uncertainty, so that the estimate starts at the expected gain.
 
     Args:
-        loop: Loop; the estimated gain in `state` is written.
+        loop: VisualLoop; the estimated gain in `state` is written.
 
     Returns:
         The gain, scalar, in output per hand displacement (and per s, s^2).
@@ -200,10 +212,12 @@ def estimate_element_gain(loop):
 
 @compiled
 def decide_hand_reference(loop, tick, target, seen, hand):
-    """Run one decision: update the element estimate and compute the hand's reference.
+    """Run one visual decision of the operator: compute the hand's reference from the observed error.
+
+    The model of the controlled element is updated first; its gain scales the action.
 
     Args:
-        loop: Loop, written.
+        loop: VisualLoop, written.
         tick: number of the decision, scalar.
         target: present reference of the output, scalar.
         seen: present output, scalar.
@@ -248,11 +262,13 @@ def decide_hand_reference(loop, tick, target, seen, hand):
 
 
 def operator_response(operator: Operator, form: int, frequencies: np.ndarray, late: float | None = None) -> np.ndarray:
-    """Return the operator's describing function for unit gain, including the neuromuscular lag.
+    """Return the operator's describing function (hand per error) at frequencies, for unit gain.
+
+    It contains equalisation, delay and neuromuscular lag.
 
     Args:
         operator: parameters of the operator.
-        form: form of the controlled element.
+        form: form of the controlled element: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
         frequencies: (m,) [rad/s].
         late: delay, including that of lead generation [s]; by default the operator's.
 
@@ -268,7 +284,11 @@ def operator_response(operator: Operator, form: int, frequencies: np.ndarray, la
 
 
 def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, margin: float) -> float:
-    """Return the maximum operator gain that keeps both margins, for an element of unit gain."""
+    """Return the maximum operator gain that keeps phase and gain margin, for an element of unit gain.
+
+    The element has `form` integrations and the first-order `lag` [s]; `late` is the total delay [s],
+    and `margin` the phase margin [rad]. The crossover frequency has an upper limit, too.
+    """
     w = np.geomspace(0.02, 60.0, 4000)
     loop = operator_response(operator, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))
@@ -281,7 +301,7 @@ def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, m
 
 
 def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.ndarray:
-    """Return the exact discrete form of the lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)`.
+    """Discretise the neuromuscular lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)` exactly.
 
     Args:
         frequency: natural frequency [rad/s]; 0 for no lag.
@@ -289,7 +309,8 @@ def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.nd
         step: time for which the input is held [s].
 
     Returns:
-        (6,) a11, a12, b1, a21, a22, b2 of position and rate.
+        (6,) a11, a12, b1, a21, a22, b2: next position `a11 x + a12 v + b1 u` and next rate
+        `a21 x + a22 v + b2 u` for position x, rate v and input u.
     """
     if frequency <= 0.0:
         return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
@@ -302,7 +323,7 @@ def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.nd
 
 
 class TrackingRecord(NamedTuple):
-    """Record of a tracking task.
+    """Record of a tracking task, in which a hand keeps a displayed response on a target.
 
     Attributes:
         time: (n,) [s].
@@ -328,7 +349,8 @@ def make_sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float 
         seed: seed of the phases.
 
     Returns:
-        (n,) target of unit standard deviation, and the (10,) frequencies [rad/s].
+        (n,) target of unit standard deviation, and the (10,) frequencies [rad/s]. They are multiples
+        of the base frequency by prime numbers, so that none is a harmonic of another.
 
     Source: form of the forcing functions of McRuer et al. 1965, AFFDL-TR-65-15.
     """
@@ -345,7 +367,10 @@ def make_sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float 
 
 @compiled
 def _simulate_tracking(loop, lag, form, gain, target, fine, hand, response):
-    """Simulate the closed loop of `simulate_tracking`; `hand` and `response` are written."""
+    """Simulate operator and controlled element in a closed loop; write `hand` and `response`.
+
+    `lag` is the discrete neuromuscular lag, and `fine` the number of steps per decision.
+    """
     place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
     step = loop.parameters[STEP] / fine
     wanted = 0.0
@@ -378,7 +403,7 @@ def simulate_tracking(
         operator: parameters of the operator.
         form: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
         gain: gain of the element, unknown to the operator.
-        target: (n,) at intervals of `step`.
+        target: (n,) target at intervals of `step`.
         step: sampling period of the record [s].
         steps_per_decision: number of steps per decision.
         seed: seed of the noise and of the expected gain.
@@ -386,7 +411,7 @@ def simulate_tracking(
             is exact.
 
     Returns:
-        The record.
+        Time, target, response and hand of the simulated task.
     """
     rng = np.random.default_rng([seed, 1967])
     loop = make_visual_loop(
@@ -406,7 +431,7 @@ def simulate_tracking(
 
 
 class CrossoverProperties(NamedTuple):
-    """Properties of an open loop `Yp Yc` around its crossover frequency.
+    """Properties of the open loop of operator and controlled element around its crossover frequency.
 
     Attributes:
         frequency: frequency of unit gain [rad/s].
@@ -422,15 +447,15 @@ class CrossoverProperties(NamedTuple):
 def measure_describing_functions(
     records: Sequence[TrackingRecord], frequencies: np.ndarray, skip: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Measure describing functions at the frequencies of a sum of sines from records.
+    """Measure the frequency responses of operator and open loop from tracking records.
 
     Args:
-        records: records with targets of these frequencies, all of one length.
+        records: records with a sum of sines of these frequencies as target, all of one length.
         frequencies: (m,) [rad/s], integer multiples of 1 / (record length after `skip`).
         skip: initial time that is discarded [s].
 
     Returns:
-        (m,) complex response per error (Yp Yc) and hand per error (Yp).
+        (m,) complex response per error, the open loop Yp Yc, and (m,) hand per error, the operator Yp.
 
     Source: McRuer et al. 1965, AFFDL-TR-65-15: ratio of cross spectra with the target.
     """
@@ -452,10 +477,10 @@ def find_crossover(frequencies: np.ndarray, open_loop: np.ndarray) -> CrossoverP
 
     Args:
         frequencies: (m,) increasing [rad/s].
-        open_loop: (m,) complex.
+        open_loop: (m,) complex frequency response.
 
     Returns:
-        The crossover properties; NaN if the gain does not fall through 1.
+        The crossover properties; all NaN if the gain does not fall through 1.
     """
     decades, size = np.log10(frequencies), 20.0 * np.log10(np.abs(open_loop))
     phase = np.unwrap(np.angle(open_loop))

@@ -1,9 +1,9 @@
-"""Control of the master: measure the joystick, reflect the machine's force, drive the coils.
+"""Control of the master, the levitated joystick: measure it, reflect forces, drive its coils.
 
 The coils give every joystick axis a spring and damper to its centre, about the handle (remote
-centre of compliance). Stiffness or force follows the data from the machine. One kernel implements
-all structures at 200 Hz. A protection function pushes the handle back before the machine tips
-over.
+centre of compliance). Stiffness or force follows the data from the machine. One compiled function
+implements all structures of force reflection at 200 Hz. A protection function pushes the handle back
+before the machine tips over.
 """
 
 import math
@@ -92,8 +92,9 @@ class MasterParameters(NamedTuple):
     """Parameters of the master's control.
 
     Attributes:
-        axis: (6, 18) parameters of every joystick axis, columns above; SI. GAIN is the coordinate's
-            rate per displacement beyond the dead band [1/s], or its position per displacement.
+        axis: (6, 18) parameters of every joystick axis, columns as in `axis_table`; SI. GAIN is the
+            coordinate's rate per displacement beyond the dead band [1/s], or its position per
+            displacement.
         mass: (1,) mass of the flotor [kg].
         inertia: (3,) moments of inertia about the handle [kg m^2].
         centre_of_mass: (3,) centre of mass in the coils' frame [m].
@@ -102,8 +103,9 @@ class MasterParameters(NamedTuple):
         to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
         max_current: (1,) maximum current [A].
         resolution: (6,) resolution of the sensing [m], [rad].
-        kind: (4,) structure, mode, whether the coordinating force uses the handle's position, and
-            whether the axes are decoupled.
+        kind: (4,) structure of force reflection (NONE .. PASSIVITY_CONTROL), mode (RATE or POSITION),
+            whether the coordinating force uses the handle's position, and whether the axes are
+            decoupled.
     """
 
     axis: np.ndarray
@@ -124,10 +126,10 @@ class MasterState(NamedTuple):
     Attributes:
         handle: (6,) measured displacement [m] and rotation vector [rad].
         speed: (6,) its rate.
-        push: (6,) force of the coils on the handle [N], [N m].
+        push: (6,) force of the coils on the handle, without the flotor's weight [N], [N m].
         stiffness: (6,) stiffness of every axis [N/m], [N m/rad].
         hand: (6,) estimated force of the hand [N], [N m].
-        momentum: (6,) momentum of the observer.
+        momentum: (6,) momentum of the hand force observer [N s], [N m s].
         integral: (6,) integral of the rate command, for four channels under rate control [m],
             [rad].
         before: (6,) low-pass filtered force from the machine, for its derivative [N], [N m]; or
@@ -137,7 +139,8 @@ class MasterState(NamedTuple):
         limited: (1,) factor by which the currents were scaled down; 1 if not, 0 if they are off
             because the reading is not finite.
         energy: (2,) energy from the hand into the handle [J]: present value, and minimum so far.
-        line: (6, 10) end of a passive channel: `passive_line`, and TOTAL, BUDGET to send.
+        line: (6, 10) end of a passive channel: 8 elements of `passive_line`, then the signal and the
+            energy for the next packet.
     """
 
     handle: np.ndarray
@@ -166,7 +169,7 @@ def build_master(
         coordinates: task coordinates of the arm.
 
     Returns:
-        The parameters, and a state at the centre.
+        The parameters, and a state with the handle at its centre.
 
     Raises:
         InputError: inconsistent gains, a coordinate that the arm does not have, or one joystick
@@ -199,15 +202,15 @@ def build_master(
 
 @compiled
 def unpack_master(flat):
-    """Return the parts of `flat_view(Master)`.
+    """Return the fields of MasterParameters as views of a flat array.
 
     Args:
-        flat: (168,) array.
+        flat: (168,) array, as from `flat_view` of a MasterParameters.
 
     Returns:
-        Master, views of it.
+        MasterParameters.
 
-    Source: order and shapes of Master.
+    Source: order and shapes of MasterParameters.
     """
     axis, rest = split_array(flat, 6 * COLUMNS)
     mass, rest = split_array(rest, 1)
@@ -226,13 +229,13 @@ def unpack_master(flat):
 
 @compiled
 def unpack_master_state(flat):
-    """Return the parts of `flat_view(MasterState)`.
+    """Return the fields of MasterState as views of a flat array.
 
     Args:
-        flat: (123,) array.
+        flat: (123,) array, as from `flat_view` of a MasterState.
 
     Returns:
-        MasterState, views of it.
+        MasterState.
 
     Source: order and shapes of MasterState.
     """
@@ -256,14 +259,15 @@ def unpack_master_state(flat):
 
 @compiled
 def measure_handle(numbers, qpos, period, s):
-    """Measure the handle with the sensing resolution, its rate by differences, and its energy.
+    """Measure the handle's displacement, its rate, and the energy that the hand has supplied.
 
-    The energy from the hand follows from the kinetic energy and the work of the coils, without the
-    lag of the estimated hand force.
+    The displacement is rounded to the sensing resolution, and the rate is its difference. The energy
+    follows from the kinetic energy and the work of the coils, without the lag of the estimated hand
+    force.
 
     Args:
-        numbers: Master.
-        qpos: (7,) flotor position [m] and quaternion.
+        numbers: MasterParameters.
+        qpos: (7,) flotor position [m] and quaternion, scalar first.
         period: time since the last reading, scalar [s]; 0 for the first one.
         s: MasterState; `handle`, `speed` and `energy` are written.
 
@@ -292,7 +296,10 @@ def measure_handle(numbers, qpos, period, s):
 
 @compiled
 def _applied_force(numbers, s, i):
-    """Return the force of coils and weight on a handle axis since the last reading."""
+    """Return the force on handle axis i since the last reading, without that of the hand [N], [N m].
+
+    It is the force of the coils plus the part of the weight that limited currents do not carry.
+    """
     given = s.limited[0] * s.push[i]
     if i < 3:  # part of the flotor's weight that the limited currents do not carry
         given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
@@ -301,14 +308,17 @@ def _applied_force(numbers, s, i):
 
 @compiled
 def compute_reflection(numbers, packet, fresh, period, s):
-    """Compute the force on every axis of the handle with the selected structure.
+    """Compute the coils' force on every axis of the handle, which reflects the machine's force.
+
+    It consists of spring, damper and detent of the joystick, and of the selected structure of force
+    reflection.
 
     Args:
-        numbers: Master.
+        numbers: MasterParameters.
         packet: (8, k) data from the machine in task units: tip force, position and speed of the tip
             and of its reference, stiffness, damping and mass of the task.
         fresh: factor on the packet, scalar: 1, falling to 0 while the channel is silent.
-        period: scalar [s].
+        period: control period, scalar [s].
         s: MasterState; `push`, `stiffness`, `integral`, `before` and `line` are written.
 
     Returns:
@@ -376,7 +386,10 @@ def compute_reflection(numbers, packet, fresh, period, s):
 
 @compiled
 def _coordinating_force(row, mode, packet, period, s, i):
-    """Return the spring and damper force between the machine and its command from the handle."""
+    """Return the coordinating force of handle axis i: a spring and damper to the machine [N], [N m].
+
+    They act on the difference between the machine's motion and that which the handle commands.
+    """
     gain, x, v, c, sign = row[GAIN], s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
     place, speed = sign * packet[TIP_POSITION, c], sign * packet[TIP_SPEED, c]
     if mode == POSITION:
@@ -390,7 +403,10 @@ def _coordinating_force(row, mode, packet, period, s, i):
 
 @compiled
 def _passive_channel_force(numbers, row, packet, period, s, i):
-    """Return the force of a passive channel against the handle; write the next packet's data."""
+    """Return the force of a passive channel against the motion of handle axis i [N], [N m].
+
+    The signal and the energy for the next packet are written to the state.
+    """
     c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
     total, budget = sign * packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c]
     if numbers.kind[0] == WAVE_VARIABLES:
@@ -406,9 +422,10 @@ def _passive_channel_force(numbers, row, packet, period, s, i):
 
 @compiled
 def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
-    """Return the reflected force and velocity of the four-channel structures.
+    """Return the force on handle axis i with four channels: reflected force and motion coupling.
 
-    Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
+    Under rate control the channel for the force, `C2 = s / k_v` with the rate gain k_v,
+    differentiates the force below 20 rad/s.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
     x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
@@ -426,7 +443,10 @@ def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
 
 @compiled
 def _decoupled_wrench(numbers, turn, s, wrench):
-    """Compute the wrench that makes every axis an independent mass under its force."""
+    """Compute the coil wrench (6,) with which every handle axis moves as an independent mass.
+
+    Each axis is driven by its own force in `s.push`; `turn` is the rotation matrix, flotor to world.
+    """
     mass, arm = numbers.mass[0], numbers.centre_of_mass - numbers.handle
     inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
     square = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
@@ -440,14 +460,15 @@ def _decoupled_wrench(numbers, turn, s, wrench):
 
 @compiled
 def drive_coils(numbers, quaternion, period, s):
-    """Compute the coil currents for `push` plus the flotor's weight, and estimate the hand force.
+    """Compute the coil currents of this period, and estimate the hand force.
 
-    If a current exceeds its limit, the whole wrench is scaled down and keeps its direction.
+    The currents produce the force `push` on the handle and carry the flotor's weight. If a current
+    exceeds its limit, the whole wrench is scaled down and keeps its direction.
 
     Args:
-        numbers: Master.
-        quaternion: (4,) orientation of the flotor.
-        period: scalar [s].
+        numbers: MasterParameters.
+        quaternion: (4,) orientation of the flotor, scalar first.
+        period: control period, scalar [s].
         s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
 
     Returns:
@@ -481,7 +502,10 @@ def drive_coils(numbers, quaternion, period, s):
 
 @compiled
 def _reset_master(s):
-    """Switch currents and command off; the next valid reading starts from rest."""
+    """Set currents, handle motion and forces to 0 after an invalid reading.
+
+    The next valid reading starts from rest.
+    """
     for i in range(6):
         s.handle[i], s.speed[i], s.push[i] = 0.0, 0.0, 0.0
         s.hand[i], s.momentum[i], s.currents[i] = 0.0, 0.0, 0.0
@@ -490,23 +514,23 @@ def _reset_master(s):
 
 @compiled
 def step_master(numbers, qpos, packet, fresh, period, first, s):
-    """Run one period of the master: read the handle, reflect, drive the coils.
+    """Run one control period of the master: measure the handle, reflect forces, drive the coils.
 
     A reading that is not finite switches the coils off and leaves the machine without a command.
 
     Args:
-        numbers: Master.
-        qpos: (7,) flotor position [m] and quaternion.
-        packet: (8, k) see `compute_reflection`.
-        fresh: see `compute_reflection`, scalar.
-        period: scalar [s].
+        numbers: MasterParameters.
+        qpos: (7,) flotor position [m] and quaternion, scalar first.
+        packet: (8, k) data from the machine, rows as in `compute_reflection`.
+        fresh: factor on the packet, scalar, 0 to 1.
+        period: control period, scalar [s].
         first: whether this is the first period, scalar.
         s: MasterState, written.
 
     Returns:
         Nothing.
 
-    Source: this module.
+    Source: `measure_handle`, `compute_reflection` and `drive_coils` in turn.
     """
     if not np.isfinite(qpos).all():
         _reset_master(s)
@@ -521,7 +545,9 @@ _FULL_ACTION_RANGE = 0.1  # range of the tipping ratio, above the allowed one, o
 
 
 def tipping_ratio(tip_over: TipOver, radius: float, force: float) -> float:
-    """Return the ratio of a vertical tip force's moment to the tipping moment.
+    """Return how close a vertical tip force brings the machine to tipping over.
+
+    It is the ratio of the moment of the force to that of the machine's weight about the same edge.
 
     Args:
         tip_over: tip-over parameters of the machine.
@@ -529,8 +555,8 @@ def tipping_ratio(tip_over: TipOver, radius: float, force: float) -> float:
         force: force of the environment on the tip, positive up [N].
 
     Returns:
-        1 if the machine tips: backwards about its rear edge if pushed up, forwards about the front
-        edge if pulled down.
+        Ratio [1]; the machine tips at 1: backwards about its rear edge if pushed up, forwards about
+        the front edge if pulled down.
 
     >>> machine = TipOver(mass=20000.0, centre_of_mass_behind=0.4, tipping_edge=1.6)
     >>> round(tipping_ratio(machine, 6.4, 29430.0), 3)
@@ -563,11 +589,11 @@ def tip_over_wrench(
     Args:
         tip_over: tip-over parameters of the machine.
         numbers: parameters of the master.
-        packet: (8, k) data from the machine.
-        start: (5,) pose at the start.
-        handle: (6,) measured displacement [m], [rad].
+        packet: (8, k) data from the machine, rows as in `compute_reflection`.
+        start: (5,) pose of the tip at the start: r [m], theta [rad], z [m], attitude, head [rad].
+        handle: (6,) measured displacement of the handle [m], [rad].
         speed: (6,) its rate [m/s], [rad/s].
-        extra: (6,) written [N], [N m].
+        extra: (6,) additional force on the handle, written [N], [N m]; 0 without danger.
 
     Source: Zhu 1994, chapter 6 (tip-over of an excavator that presses too hard).
     """

@@ -1,12 +1,14 @@
 """Identification of the operator model from a record of compensatory tracking.
 
+In compensatory tracking the operator sees the error between target and response, and keeps it small.
 The operator observes the error between target and response and moves the hand. The describing
 function `Yp = K (equalisation) e^(-tau s) omega^2 / (s^2 + 2 zeta omega s + omega^2)` is fitted to
 error and hand. The operator's noise passes through the loop and is part of the error, so that an
-ordinary fit is biased. The part of the error that the target causes is therefore the instrument
+ordinary fit is biased. The part of the error that the target causes, e_target, is therefore the instrument
 (refined instrumental variables): the equations
-`sum dYp/dtheta e_target * W (hand - Yp error) = 0` hold at the true parameters for any remnant, and
-their covariance gives the standard errors. W whitens the remnant.
+`sum dYp/dtheta e_target * W (hand - Yp error) = 0` hold at the true parameters theta for any remnant,
+and their covariance gives the standard errors. The remnant is the part of the hand's motion that Yp
+does not explain; the filter W whitens it.
 
 The instrument is estimated as well. Its errors come from the same remnant as the residual. If the
 remnant is most of the error, they determine the scatter of the estimates. Standard errors are
@@ -64,7 +66,7 @@ _SAMPLE_COUNT = 400
 
 
 class ParameterEstimate(NamedTuple):
-    """An estimated parameter.
+    """An estimated parameter with its 95 % confidence interval.
 
     Attributes:
         value: estimate.
@@ -95,7 +97,7 @@ class OperatorFit(NamedTuple):
         duration: analysed duration [s].
         notes: warnings for the user.
         frequencies: (m,) frequencies of the describing function [rad/s].
-        response: (m,) complex describing function Yp of the model.
+        response: (m,) complex describing function Yp of the model, hand per error.
     """
 
     equalisation: str
@@ -110,7 +112,7 @@ class OperatorFit(NamedTuple):
 
 
 def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[TrackingRecord, list[str]]:
-    """Read a record of tracking from a CSV or Parquet file.
+    """Read time, target, response and hand motion of a tracking task from a CSV or Parquet file.
 
     Columns are `time`, `target`, `response` and `hand`, or the names in `names`. Without a column
     `hand`, a column `force` is used as the operator's output (an isometric stick). A unit in the
@@ -122,7 +124,7 @@ def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[T
         names: `time`, `target`, `response`, `hand` -> column.
 
     Returns:
-        The record as sampled, and notes.
+        The record as sampled, and notes for the user on repaired data.
 
     Raises:
         InputError: the file is invalid; the message gives file, column, row and a remedy.
@@ -173,15 +175,16 @@ def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[T
 
 
 def identify_operator(record: TrackingRecord, equalisation: str | None = None, source: str = "record") -> OperatorFit:
-    """Fit the operator model to a record of compensatory tracking.
+    """Identify gain, delay, equalisation and neuromuscular lag of a person from a tracking record.
 
     Args:
         record: record as sampled.
-        equalisation: `gain`, `lead`, `lag` or `integral`; by default the best fit is selected.
+        equalisation: `gain`, `lead`, `lag` or `integral`, the form of the operator's compensation; by
+            default the best fit is selected.
         source: name of the record in messages.
 
     Returns:
-        The fit.
+        The fitted operator model with confidence intervals and warnings.
 
     Raises:
         InputError: the record is too short or too slow, or the hand does not respond to the target.
@@ -227,7 +230,11 @@ class _EqualisationFit(NamedTuple):
 
 
 def _resample_record(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
-    """Resample to equidistant signals without mean; also return notes."""
+    """Resample a record to equidistant signals without mean, at no more than about 25 Hz.
+
+    Return sampling period [s], signals `target`, `error`, `hand` and `response`, and notes for the
+    user. Raise InputError for a short, slow or interrupted record.
+    """
     time, notes = record.time, []
     spacing = float(np.median(np.diff(time)))
     if time[-1] - time[0] < _MIN_DURATION:
@@ -262,7 +269,7 @@ def _highpass_response(s: np.ndarray) -> np.ndarray:
 
 
 def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
-    """Filter a signal with a transfer function of s, from rest."""
+    """Filter a sampled signal with the transfer function `response(s)`, starting from rest."""
     pad = len(values) + round(4.0 * _SETTLING_TIME / step)
     s = 2j * np.pi * np.fft.rfftfreq(pad, step)
     return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
@@ -271,10 +278,11 @@ def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
 def _estimate_instrument(
     target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
-    """Estimate the part of the error that the target causes, by least squares on `kept` rows.
+    """Estimate the part of the error `seen` that the target causes, as instrumental variable.
 
-    Each part of the record uses the response that is fitted to the other parts, so that its own
-    remnant is not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
+    The impulse response from target to error is fitted by least squares to the rows in `kept`. Each
+    part of the record uses the response that is fitted to the other parts, so that its own remnant is
+    not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
     """
     apart = max(1, round(_TAP_SPACING / step))
     lags = np.arange(0, round(_RESPONSE_LENGTH / step), apart)
@@ -303,7 +311,10 @@ def _parameter_names(kind: str) -> tuple[str, ...]:
 
 
 def _operator_response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Return the operator's describing function."""
+    """Return the operator's describing function Yp, hand per error, at complex frequencies s.
+
+    `kind` is the equalisation, and `logs` are the logarithms of its parameters.
+    """
     p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     made = p["gain"] * np.exp(-p["delay"] * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
@@ -317,7 +328,7 @@ def _operator_response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray
 
 
 def _response_derivatives(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
-    """Return the derivatives of `_operator_response` with respect to the logarithms."""
+    """Return the derivatives of the describing function Yp by the logarithms of its parameters."""
     p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     whole = _operator_response(kind, logs, s)
@@ -338,7 +349,10 @@ def _predict_hand(data: _TrackingData, kind: str, logs: np.ndarray, values: np.n
 
 
 def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
-    """Return the whitening filter of a noise: 1 and the negative autoregression coefficients."""
+    """Fit an autoregression to a noise and return its whitening filter.
+
+    The filter is 1, followed by the negative autoregression coefficients.
+    """
     from scipy.linalg import solve_toeplitz
 
     order = max(4, round(_WHITENER_LENGTH / step))
@@ -351,7 +365,10 @@ def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
 
 
 def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None:
-    """Fit by refined instrumental variables from several delays; None if no start fits."""
+    """Fit the operator model with one form of equalisation by refined instrumental variables.
+
+    The fit starts from the best of several delays. Return None if the hand does not respond.
+    """
     from scipy.optimize import least_squares
     from scipy.signal import lfilter
 
@@ -401,10 +418,11 @@ def _instrument_equations(
     data: _TrackingData, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
     instrument: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return whitened instruments (n, m + 1), derivatives (n, m + 1), and remnant (n,).
+    """Build the instrumental-variable equations at the present parameters.
 
-    The last column is the response of the high-pass to an initial displacement of the hand, which
-    lasts longer than the discarded rows.
+    Return whitened instruments (n, m + 1), whitened derivatives (n, m + 1) of the predicted hand by
+    the m logarithms, and the whitened remnant (n,). The last column is the response of the high-pass
+    to an initial displacement of the hand, which lasts longer than the discarded rows.
     """
     from scipy.signal import lfilter
 
@@ -424,14 +442,14 @@ def _instrument_equations(
 
 
 def _solve_equations(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Solve `z^T (rest - d x) = 0` for x."""
+    """Solve the instrumental-variable equations `z^T (rest - d x) = 0` for the parameter step x."""
     scale = np.linalg.norm(z, axis=0) + 1e-300
     matrix, right = (z / scale).T @ (d / scale), (z / scale).T @ rest
     return np.linalg.lstsq(matrix, right, rcond=1e-10)[0] / scale
 
 
 def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
-    """Return the covariance of the logarithms, scaled up to the jackknife's variances.
+    """Return the covariance of the parameters' logarithms, enlarged to variances of a jackknife.
 
     The first estimate assumes a stationary whitened remnant and a known instrument. The jackknife
     leaves out each part of the record in turn and estimates instrument and parameters again, since
@@ -466,7 +484,7 @@ def _build_operator_fit(
     fit: _EqualisationFit, data: _TrackingData, signals: Mapping[str, np.ndarray], record: TrackingRecord,
     notes: list[str],
 ) -> OperatorFit:  # fmt: skip
-    """Build the fit: estimates with intervals, remnant, crossover and margins."""
+    """Build the user's result from a fit: estimates with intervals, remnant, crossover and margins."""
     errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     estimates: dict[str, ParameterEstimate] = {}
     for name, log, error in zip(fit.names, fit.log_parameters, errors, strict=True):
@@ -500,7 +518,11 @@ def _make_estimate(log: float, error: float, unit: str, inside: bool = True) -> 
 
 
 def _estimate_remnant(fit: _EqualisationFit, data: _TrackingData) -> ParameterEstimate:
-    """Return the power density of the observation noise over pi times the observed variance."""
+    """Estimate the operator's remnant, a noise-to-signal ratio [1].
+
+    It is the power density of the observation noise divided by pi times the variance of the observed
+    error (and of its rate for an operator who generates lead).
+    """
     from scipy.signal import welch
 
     length = min(len(fit.noise), round(15.0 / data.step))
@@ -530,7 +552,11 @@ def _estimate_crossover(
     fit: _EqualisationFit, data: _TrackingData, signals: Mapping[str, np.ndarray], w: np.ndarray,
     estimates: dict[str, ParameterEstimate], notes: list[str],
 ) -> str:  # fmt: skip
-    """Identify the controlled element; add crossover and margins with intervals to `estimates`."""
+    """Identify the controlled element K, K/s or K/s^2 and add crossover and margins to `estimates`.
+
+    Their intervals follow from samples of the fitted parameters. Return the form of the element, empty
+    if none fits; then nothing is added.
+    """
     first, hand = round(_SETTLING_TIME / data.step), signals["hand"]
     best = (math.inf, 0, 1.0, 0.0)
 
@@ -572,7 +598,10 @@ def _estimate_crossover(
 
 
 def _loop_margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, float]:
-    """Return crossover frequency, phase margin, and gain where the phase is -180 degrees."""
+    """Return crossover frequency [rad/s], phase margin [rad], and loop gain at -180 degrees [1].
+
+    `loop` is the open-loop response at the frequencies w; values that do not exist are NaN.
+    """
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
     falls = np.flatnonzero((size[:-1] >= 0.0) & (size[1:] < 0.0))
@@ -588,7 +617,9 @@ def _loop_margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, fl
 
 
 def format_operator_file(fit: OperatorFit, name: str, source: str) -> str:
-    """Convert a fit to an operator file, for `perception: {file: ...}` of a scenario.
+    """Convert an identified operator to the YAML text of an operator file.
+
+    A scenario uses the file as `perception: {file: ...}`.
 
     The file contains only the identifiable parameters; the others come from the default file.
 

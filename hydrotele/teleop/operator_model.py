@@ -3,16 +3,16 @@
 The operator does not know the contact force or the machine's gains. The operator feels the handle's
 motion, sees the tip and its contact, and in `track` also a display of the reference force. The
 effect of a push is learnt from earlier pushes. The joystick's own springs and the scale of its
-reflection are known. The operator decides at 50 Hz; visual control follows
+reflection are known to the operator. Decisions are made at 50 Hz; visual control follows
 `teleop.manual_control`, and the parameters are in `teleop.operator_parameters`.
 
 The neuromuscular dynamics convert a reference displacement to forces on the handle.
 
 A force or a displacement is felt with an error in proportion to its size (Weber's law). Combining
-both to a stiffness adds another error: people resolve compliance by 22 % when they cannot use work
-or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception & Psychophysics 57),
-though force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb movement by 8 %
-(Jones, Hunter and Irwin 1992, ibid. 52). One exploration gives one impression.
+both to a stiffness adds another error. People resolve compliance by 22 % when they cannot use work
+or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception & Psychophysics 57). They
+resolve force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb movement by 8 % (Jones,
+Hunter and Irwin 1992, ibid. 52). The errors stay constant during one exploration of the handle.
 """
 
 import math
@@ -68,7 +68,7 @@ from hydrotele.teleop.operator_parameters import Operator, scenario_operator
 
 
 class PerceptionErrors(NamedTuple):
-    """Perception errors of a hand in n decisions.
+    """Random errors of perceived forces, displacements and stiffnesses in n decisions.
 
     Attributes:
         force: (n,) factor on the perceived force.
@@ -84,10 +84,13 @@ class PerceptionErrors(NamedTuple):
 
 
 def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: int, step: float) -> PerceptionErrors:
-    """Draw the perception errors of a run, one set per exploration.
+    """Draw random perception errors for all decisions of a run.
+
+    They are log-normal and constant during one exploration of the handle.
 
     Args:
-        operator: operator with Weber fractions; an exploration lasts `correction_interval`.
+        operator: operator with Weber fractions (relative standard deviations of perceived quantities);
+            an exploration lasts `correction_interval`.
         rng: random generator of the errors.
         count: number of decisions.
         step: time between two decisions [s].
@@ -105,7 +108,7 @@ def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: 
 def perceive_stiffness(
     force: float, displacement: float, errors: PerceptionErrors, decision: int
 ) -> float:  # fmt: skip
-    """Return the stiffness of a spring as perceived by a hand.
+    """Return the stiffness of a spring as a hand perceives it: force over displacement, with errors.
 
     Args:
         force: force on the hand [N].
@@ -128,7 +131,7 @@ _MAX_POSITION_GAP, _MAX_ROTATION_GAP = (
 
 
 class NeuromuscularState(NamedTuple):
-    """Parameters and state of the neuromuscular dynamics.
+    """Parameters and state of the neuromuscular dynamics of arm and hand, for the six handle axes.
 
     Attributes:
         reference: (6,) reference displacement of the handle [m], [rad].
@@ -138,13 +141,13 @@ class NeuromuscularState(NamedTuple):
         correction: (6,) learnt additional force [N], [N m].
         force: (6,) force on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
-        cross: (1,) stiffness between x and y [N/m].
+        cross: (1,) coupling stiffness of the arm between x and y [N/m].
         max_force: (6,) maximum force [N], [N m].
         weight: (6,) weight of the hand, which the muscles carry [N], [N m].
         gain: (1,) integral gain of the correction [1/s].
         rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
         rate: (6,) its rate.
-        lag: (6,) discrete lag of `neuromuscular_matrix`, for one control period.
+        lag: (6,) discrete neuromuscular lag for one control period, from `neuromuscular_matrix`.
     """
 
     reference: np.ndarray
@@ -164,15 +167,15 @@ class NeuromuscularState(NamedTuple):
 
 @compiled
 def unpack_neuromuscular_state(flat):
-    """Return the parts of `flat_view(Muscles)`.
+    """Return the fields of NeuromuscularState as views of a flat array.
 
     Args:
-        flat: (80,) array.
+        flat: (80,) array, as from `flat_view` of a NeuromuscularState.
 
     Returns:
-        Muscles, views of it.
+        NeuromuscularState.
 
-    Source: order and shapes of Muscles.
+    Source: order and shapes of NeuromuscularState.
     """
     wanted, rest = split_array(flat, 6)
     spring, rest = split_array(rest, 6)
@@ -194,15 +197,16 @@ def unpack_neuromuscular_state(flat):
 
 @compiled
 def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
-    """Compute the muscle forces of one period from the reference displacement.
+    """Compute the muscle forces on the handle in one control period from its reference displacement.
 
     Args:
-        muscles: Muscles; `correction`, `force`, `rest` and `rate` are written.
-        history: (reflex + 1, 6) ring buffer of displacements, written [m], [rad].
+        muscles: NeuromuscularState; `correction`, `force`, `rest` and `rate` are written.
+        history: (d + 1, 6) ring buffer of handle displacements for a reflex delay of d periods,
+            written [m], [rad].
         tremor: (n, 6) tremor forces [N], [N m].
         handle: (6,) present displacement [m], [rad].
         tick: number of the period, scalar.
-        period: scalar [s].
+        period: control period, scalar [s].
 
     Returns:
         Nothing.
@@ -262,27 +266,32 @@ HandInput = Callable[[], np.ndarray]
 
 
 class Observations(Protocol):
-    """Observable quantities by tick (`StationLog`)."""
+    """Recorded quantities that an operator can observe, by control tick, such as TeleoperationLog.
+
+    `touching` (n,) is true in ticks with contact; `force` (n, k) is the estimated tip force
+    [N], [N m].
+    """
 
     touching: np.ndarray
     force: np.ndarray
 
     def master(self, name: str) -> np.ndarray:
-        """Return a field of MasterState, (n, ...)."""
+        """Return the recorded history (n, ...) of a field of MasterState."""
         ...
 
     def slave(self, name: str) -> np.ndarray:
-        """Return a field of SlaveState, (n, ...)."""
+        """Return the recorded history (n, ...) of a field of SlaveState."""
         ...
 
 
 class OperatorModel:
-    """Simulate the decisions of an operator in one run.
+    """Simulated operator of one run: observes, estimates and chooses references for the handle.
 
     Attributes:
-        muscles: reference displacement and arm.
+        muscles: neuromuscular parameters and state, with the handle's reference displacement.
         tremor: (n, 6) tremor forces [N], [N m].
-        displacement_history: (reflex + 1, 6) recent displacements of the handle [m], [rad].
+        displacement_history: (d + 1, 6) ring buffer of recent handle displacements, for a reflex delay
+            of d periods [m], [rad].
         ticks_per_decision: control ticks per decision.
         estimated_force: (decisions,) contact force that the operator estimates [N]; NaN if it is not
             relevant.
@@ -294,7 +303,7 @@ class OperatorModel:
         ticks: int,
         period: float, seed: int, hand: HandInput | None = None, folder: str = "",
     ) -> None:  # fmt: skip
-        """Prepare the operator for a run.
+        """Create the simulated operator of a run, and draw its perception errors and tremor.
 
         Args:
             pilot: teleoperation settings of the scenario.
@@ -357,7 +366,7 @@ class OperatorModel:
                 self._prepare_visual_loop(c, rng, count)
 
     def _prepare_visual_loop(self, c: int, rng: np.random.Generator, count: int) -> None:
-        """Prepare the visual control of a coordinate."""
+        """Create the visually closed loop of task coordinate c and store it in `loops`."""
         axis = _find_joystick_axis(self._numbers, c)
         row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.parameters
         turns = COORDINATES[c] not in ("r", "z")
@@ -373,10 +382,12 @@ class OperatorModel:
         )  # fmt: skip
 
     def decide(self, tick: int) -> None:
-        """Choose the handle's reference until the next decision; `muscles` is written.
+        """Choose the handle's reference displacement until the next decision.
+
+        It is written to `muscles`.
 
         Args:
-            tick: number of the control tick, a multiple of `every`.
+            tick: number of the control tick, a multiple of `ticks_per_decision`.
         """
         if isinstance(self._behaviour, FollowPath | RecordedMotion):
             self.muscles.reference[:] = self._path[tick // self.ticks_per_decision]
@@ -391,7 +402,11 @@ class OperatorModel:
                 self._steer_tip(tick)
 
     def _control_force(self, tick: int, approach: float) -> None:
-        """Control a contact force to its target by display, by feel or by imagination."""
+        """Move the handle so that the contact force approaches its target.
+
+        Before contact the handle moves to the fraction `approach` of its range. In contact the force is
+        read from a display, felt at the handle, or imagined from the operator's own pushes.
+        """
         press, number = self._target, tick // self.ticks_per_decision
         axis, row, wanted = press.axis, press.axis_parameters, self.muscles.reference
         goal = press.reference[number]
@@ -416,7 +431,17 @@ class OperatorModel:
     def _correct_by_pushes(
         self, tick: int, axis: int, way: float, goal: float, judged: float
     ) -> None:  # fmt: skip
-        """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
+        """Correct the contact force by short pushes of the handle beyond its dead band.
+
+        Between pushes the handle rests inside the dead band and the operator observes the force.
+
+        Args:
+            tick: number of the control tick.
+            axis: number of the joystick axis.
+            way: direction of the handle that increases the force, +1 or -1.
+            goal: target force [N].
+            judged: force that the operator perceives at present [N].
+        """
         row, now, wanted = self._target.axis_parameters, tick * self._period, self.muscles.reference
         if self._belief is None:
             push = self.loops[int(row[COORDINATE])].state[ESTIMATED_GAIN] * self.parameters.task_stiffness
@@ -455,10 +480,10 @@ class OperatorModel:
             self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[MIN_STIFFNESS]
 
     def _felt_load_stiffness(self, axis: int, way: float, felt: int) -> float:
-        """Return the stiffness that the muscles last worked against [N/m].
+        """Return the handle's stiffness that the muscles last worked against [N/m].
 
-        It is free of perception errors, since reflexes need no judgement; muscle noise is in the
-        tremor.
+        `felt` is the tick of the delayed observation. The result is free of perception errors, since
+        reflexes need no judgement; muscle noise is in the tremor.
         """
         row, x = self._target.axis_parameters, float(self._handle[felt, axis])
         if way * x > _MIN_FELT_DISPLACEMENT:
@@ -468,7 +493,10 @@ class OperatorModel:
         return self._met
 
     def _force_variance(self, row: list[float], force: float) -> float:
-        """Return the variance of an estimated contact force as known to the operator [N^2]."""
+        """Return the variance that the operator assumes for an observed contact force [N^2].
+
+        It follows from display noise or from Weber fractions, depending on the force reflection.
+        """
         him, largest = self.parameters, self._target.tolerance / _FORCE_TOLERANCE_RATIO
         if self._target.is_force_displayed:
             return (him.display_noise * largest) ** 2
@@ -481,7 +509,12 @@ class OperatorModel:
     def _judge_force(
         self, tick: int, axis: int, way: float, felt: int, looked: int, touching: bool
     ) -> float:  # fmt: skip
-        """Return the contact force that the operator estimates now, at least 0 [N]."""
+        """Return the contact force that the operator perceives at present, at least 0 [N].
+
+        It is read from the display, felt as stiffness or force of the handle, or, without any
+        reflection, imagined from the operator's own pushes. `felt` and `looked` are the ticks of the
+        delayed observations by touch and by sight.
+        """
         row, reflection, number = (
             self._target.axis_parameters,
             self._pilot.reflection,
@@ -515,7 +548,11 @@ class OperatorModel:
         )
 
     def _apply_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
-        """Push with the expected reaction force of the target, and let the handle move freely."""
+        """Build up the hand force that direct reflection returns at the target, for force control.
+
+        The reference follows the handle, so that the handle moves freely. `goal` is the target
+        contact force [N], and `reflex` the tick of the delayed handle position.
+        """
         share = 1.0 - math.exp(-self._step / _FORCE_BUILDUP_TIME)
         wish = way * row[REFLECTION_RATIO] * goal
         self.muscles.correction[axis] += share * (wish - self.muscles.correction[axis])
@@ -523,14 +560,17 @@ class OperatorModel:
         self.muscles.reference[axis] = self._handle[reflex, axis]  # force control
 
     def _effective_displacement(self, axis: int, tick: int) -> float:
-        """Return the handle displacement beyond the dead band, along the coordinate."""
+        """Return the handle displacement that commands motion, with the sign of the coordinate.
+
+        Under rate control it is the displacement beyond the dead band [m] or [rad].
+        """
         row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
         if self._pilot.mode == "rate":
             x = math.copysign(max(0.0, abs(x) - row[DEADBAND]), x)
         return float(row[SIGN]) * x
 
     def _steer_tip(self, tick: int) -> None:
-        """Move the tip to its target by visual control."""
+        """Choose handle references that move the tip to its targets, by visual control."""
         before, number = tick - 1, tick // self.ticks_per_decision
         for c, goals in self._goals.items():
             axis, loop = _find_joystick_axis(self._numbers, c), self.loops[c]
@@ -549,7 +589,7 @@ class OperatorModel:
 
 @dataclass
 class _ForceEstimate:
-    """Operator's estimate of a contact force and of the effect of a push.
+    """Operator's estimate of a contact force and of the effect of a push on it (Kalman filter).
 
     Attributes:
         force: mean of the force [N].
@@ -571,7 +611,10 @@ class _ForceEstimate:
         self._expected = self.push_gain
 
     def update(self, judged: float, variance: float) -> None:
-        """Update with an observed force [N], its variance [N^2] and the effect of the last push."""
+        """Update force and push gain with a perceived force [N] and its variance [N^2].
+
+        The change since the previous force is attributed to the last push.
+        """
         if self.last_push and math.isfinite(self.previous_force):
             own = self.last_push**2 * self.push_gain_variance
             share = self.last_push * self.push_gain_variance / (own + 2.0 * variance)
@@ -594,12 +637,12 @@ _FORCE_DRIFT_RATIO = 0.05  # relative change of a force between two estimates wi
 
 
 class _ForceTarget(NamedTuple):
-    """Reference force, as prepared by the operator.
+    """Target contact force of a run and how the operator reaches it, fixed before the run.
 
     Attributes:
         axis: number of the joystick axis.
-        axis_parameters: parameters of the axis.
-        force_sign: sign of the force.
+        axis_parameters: parameters of the axis, columns as in `axis_table`.
+        force_sign: sign of the target force, +1 or -1.
         push_direction: direction of the handle that increases the force.
         reference: (decisions,) reference with visual delay and noise [N].
         displayed: (decisions,) displayed reference [N]; NaN without a display.
@@ -649,7 +692,7 @@ def _make_arm_at_rest(
     operator: Operator,
     period: float,
 ) -> NeuromuscularState:
-    """Return the operator's arm at rest.
+    """Create parameters and initial state of the operator's arm and muscles, at rest.
 
     A given path is the path of the hand itself, after the neuromuscular lag. A hand that applies a
     force to the handle follows it by its compliance, which is part of the arm.
@@ -683,7 +726,10 @@ def _make_arm_at_rest(
 
 
 def _colour_noise(white: np.ndarray, band: float, period: float) -> np.ndarray:
-    """Filter white noise (n, ...) with a first-order low-pass, to unit standard deviation."""
+    """Filter white noise (n, ...) with a first-order low-pass of bandwidth `band` [rad/s].
+
+    The result has unit standard deviation.
+    """
     share = 1.0 - math.exp(-band * period)
     scale = math.sqrt((2.0 - share) / share)
     return scale * _filter_low_pass(white.reshape(len(white), -1), share).reshape(white.shape)
@@ -691,7 +737,11 @@ def _colour_noise(white: np.ndarray, band: float, period: float) -> np.ndarray:
 
 @compiled
 def _filter_low_pass(rows, share):
-    """Filter each column (n, c) by `y' = y + share (x - y)`; scipy.signal takes 2 s to import."""
+    """Filter each column of `rows` (n, c) with a first-order low-pass, `y += share (x - y)`.
+
+    `share` is the fraction 0 to 1 of the input in one step. scipy.signal is avoided, since its import
+    takes 2 s.
+    """
     out, state = np.empty_like(rows), np.zeros(rows.shape[1])
     for n in range(len(rows)):
         for c in range(len(state)):
@@ -701,7 +751,7 @@ def _filter_low_pass(rows, share):
 
 
 def _sample_hand_path(behaviour: FollowPath, count: int, step: float) -> np.ndarray:
-    """Return the reference displacements (n, 6) of a given path [m], [rad]."""
+    """Sample a path of the scenario at the decisions: displacements (n, 6) of the handle [m], [rad]."""
     time, path = step * np.arange(count), np.zeros((count, 6))
     for name, values in behaviour.path.items():
         path[:, AXES.index(name)] = _sample_signal(time, behaviour.time, values, behaviour.interpolate)
@@ -709,7 +759,7 @@ def _sample_hand_path(behaviour: FollowPath, count: int, step: float) -> np.ndar
 
 
 def read_recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
-    """Read the recorded displacements of a handle.
+    """Read recorded displacements of a handle from a file, interpolated at given times.
 
     Args:
         path: CSV or Parquet file with `time` and columns `handle.<axis>` or `<axis>`.
@@ -747,7 +797,10 @@ def read_recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
 
 
 def _sample_tip_targets(behaviour: SteerToPoses, count: int, step: float) -> dict[int, np.ndarray]:
-    """Return coordinate -> (n,) target of the tip [m], [rad]."""
+    """Sample the tip targets of a scenario at the decisions.
+
+    Return number of the coordinate -> (n,) target [m], [rad].
+    """
     time = step * np.arange(count)
     return {
         COORDINATES.index(name): _sample_signal(time, behaviour.time, values, "hold")

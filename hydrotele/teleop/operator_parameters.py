@@ -1,4 +1,4 @@
-"""Parameters of the simulated operator: operator files, sampled operators, arm and hand impedance.
+"""Parameters of the simulated human operator: files, random operators, arm and hand impedance.
 
 `hydrotele/teleop/operator.yaml` is the default file. A scenario can name another file
 (`perception: {file: my_operator.yaml}`, as `hydrotele identify-operator` writes it), which needs
@@ -34,7 +34,7 @@ DEFAULT_OPERATOR_FILE = Path(__file__).resolve().with_name("operator.yaml")
 
 
 class OperatorParameter(StrictModel):
-    """Parameter of the operator: nominal value, range from `low` to `high`, and source.
+    """Parameter of the simulated operator: nominal value, range `low` to `high`, and source.
 
     `basis` is the kind of source: measured in a study (`published`), a published value quoted from
     memory (`recalled`), fitted to a record (`identified`), or assumed (`assumption`).
@@ -58,11 +58,11 @@ Pair = tuple[PositiveFloat, PositiveFloat]
 
 
 class ArmParameters(StrictModel):
-    """Right arm with two links in a horizontal plane: shoulder, elbow, hand.
+    """Right arm with two links, upper arm and forearm, in a horizontal plane.
 
     `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' centres; `joint_stiffness`
-    [N m/rad] of the shoulder, between both, and of the elbow; `reference_posture` is the
-    posture to which the grips' parameters apply.
+    [N m/rad] of the shoulder, between both joints, and of the elbow. `reference_posture` is the
+    posture in which the parameters of the grips hold.
     """
 
     renamed = {"usual": "reference_posture"}
@@ -75,9 +75,10 @@ class ArmParameters(StrictModel):
 
 
 class OperatorFile(StrictModel):
-    """File of operator parameters: parameters, `grips` of the hand, the `arm`, and its `postures`.
+    """Contents of an operator file (YAML): `parameters`, `grips`, `arm` and its `postures`.
 
-    A posture is the position of the hand relative to the shoulder: ahead and to the left [m].
+    A grip is the impedance of a hand on the handle. A posture is the position of the hand relative to
+    the shoulder: ahead and to the left [m].
     """
 
     name: Name
@@ -97,7 +98,7 @@ class OperatorFile(StrictModel):
 
 @dataclasses.dataclass(frozen=True)
 class Operator:
-    """Parameters of one operator.
+    """Parameters of one simulated operator: vision, touch, muscles and expectations.
 
     Attributes:
         visual_delay: delay from visual stimulus to motion, without the neuromuscular lag [s].
@@ -121,8 +122,10 @@ class Operator:
         max_force: maximum force [N].
         cocontraction: co-contraction, relative to its maximum.
         cocontraction_stiffness_factor: factor on the arm stiffness at full co-contraction.
-        expected_speed: expected speed with the handle at its stop [m/s], [rad/s].
-        expected_scale: expected gain under position control [m/m], [rad/rad].
+        expected_speed: machine speed that the operator expects with the handle at its stop [m/s],
+            [rad/s].
+        expected_scale: machine displacement per handle displacement that the operator expects under
+            position control [m/m], [rad/rad].
         task_stiffness: expected ground stiffness [N/m].
         new_gain_log_std: standard deviation of the logarithm of an unknown gain.
         memory_time: time constant with which experience fades [s].
@@ -160,7 +163,10 @@ class Operator:
 
     @property
     def neuromuscular_delay(self) -> float:
-        """Delay of the neuromuscular lag at low frequencies, 2 zeta / omega [s]."""
+        """Equivalent delay of the neuromuscular lag at low frequencies [s].
+
+        It is `2 zeta / omega`, with damping ratio zeta and natural frequency omega of the lag.
+        """
         return 2.0 * self.neuromuscular_damping / self.neuromuscular_frequency
 
 
@@ -169,7 +175,7 @@ _PARAMETER_NAMES = tuple(field.name for field in dataclasses.fields(Operator))
 
 @functools.cache
 def load_operator_file(path: Path = DEFAULT_OPERATOR_FILE) -> OperatorFile:
-    """Read a file of operator parameters.
+    """Read and validate a YAML file of operator parameters.
 
     Args:
         path: path of the file; the default file if omitted.
@@ -195,7 +201,7 @@ def load_operator_file(path: Path = DEFAULT_OPERATOR_FILE) -> OperatorFile:
 
 
 def make_operator(file: OperatorFile, number: int | None, **fixed_parameters: float) -> Operator:
-    """Return the nominal or a sampled operator of a file.
+    """Create an operator from a file: the nominal one, or a random one within the ranges.
 
     Args:
         file: result of `load_operator_file`.
@@ -216,10 +222,10 @@ def make_operator(file: OperatorFile, number: int | None, **fixed_parameters: fl
 
 
 def scenario_operator(perception: OperatorSettings, folder: str = "") -> Operator:
-    """Return the operator that a scenario specifies.
+    """Create the simulated operator that a scenario specifies.
 
     Args:
-        perception: perception settings of the scenario.
+        perception: operator settings of the scenario (key `perception`).
         folder: folder of the scenario, to which its file is relative.
 
     Returns:
@@ -234,13 +240,14 @@ def scenario_operator(perception: OperatorSettings, folder: str = "") -> Operato
 
 
 def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folder: str = "") -> Joystick:
-    """Return the joystick with the hand of the scenario's operator.
+    """Return a copy of the joystick with the hand impedance of the scenario's operator.
 
-    Without `grip`, `posture` and co-contraction the hand of the joystick file is used.
+    Grip, posture and co-contraction of the settings change the impedance; without them the hand of the
+    joystick file is used.
 
     Args:
         joystick: the joystick.
-        perception: perception settings of the scenario.
+        perception: operator settings of the scenario (key `perception`).
         folder: folder of the scenario, to which its file is relative.
 
     Returns:
@@ -269,7 +276,7 @@ def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folde
 
 
 def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> HandImpedance:
-    """Return a hand with the arm's impedance in a posture.
+    """Return a copy of a hand with the horizontal mass and stiffness ellipses of an arm's posture.
 
     Args:
         hand: hand with the grip's parameters.
@@ -280,7 +287,7 @@ def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> Hand
         The hand; its vertical and rotational impedance stays that of the grip.
 
     Raises:
-        InputError: a posture is out of the arm's reach.
+        InputError: the posture is out of the arm's reach.
     """
     arm = file.arm
     assert arm  # the default file has one
@@ -295,7 +302,10 @@ def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> Hand
 
 
 def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return mass and stiffness of an arm at its hand, `J^-T A J^-1` of the joints' matrices.
+    """Compute the mass and stiffness of an arm at its hand, in the horizontal plane.
+
+    A matrix A of the joints becomes `J^-T A J^-1` at the hand, with the Jacobian J of the hand's
+    position by the joint angles.
 
     Args:
         arm: two links, with the elbow to the right of the line from shoulder to hand.
@@ -336,7 +346,7 @@ def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.nd
 
 
 def scale_hand_stiffness(hand: HandImpedance, factor: float) -> HandImpedance:
-    """Return a hand with `factor` times the stiffness and the same damping ratio.
+    """Return a copy of a hand with `factor` times the stiffness and the same damping ratio.
 
     Antagonist muscles that contract together add stiffness and damping but no force (Hogan 1984).
 

@@ -1,12 +1,14 @@
 """Both ends of a passive communication channel: wave variables and time-domain passivity control.
 
-The functions treat one axis and one period. A spring and damper at the slave's end connect the
-received reference with the slave. Their force moves the slave and is returned to the master.
+A channel is passive if it releases no more energy than has entered it, so that its delay cannot make
+the loop unstable. The functions treat one axis and one control period. A spring and damper at the
+slave's end connect the received reference with the slave. Their force moves the slave and is returned
+to the master.
 
-Wave variables transmit `u = (b v + F) / sqrt(2 b)` forward and `w = (b v - F) / sqrt(2 b)` back; a
-constant delay between them is lossless. Packets carry the sums of all waves and of their energy.
-A lost packet therefore causes no offset, a duplicate counts once, and with varying delays no more
-energy is used than was sent.
+Wave variables transmit `u = (b v + F) / sqrt(2 b)` forward and `w = (b v - F) / sqrt(2 b)` back, with
+velocity v, force F and wave impedance b; a constant delay between them is lossless. Packets carry the
+sums of all waves and of their energy. A lost packet therefore causes no offset, a duplicate counts
+once, and with varying delays no more energy is used than was sent.
 
 Passivity control transmits position forward and force back, each with the energy that has entered
 the channel at its end. The slave's reference and the master's force are limited so that no more
@@ -43,18 +45,21 @@ _CATCH_UP_RATE = 2.0  # 1/s, rate at which a limited reference catches up
 
 @compiled
 def take_received_wave(total, budget, period, end):
-    """Return the received wave that is not used yet, limited by its energy.
+    """Return the received wave for this period: all sent waves minus those that were already used.
+
+    It is limited so that no more energy is used than was sent.
 
     Args:
-        total: sum of all sent waves in the newest packet, scalar [sqrt(J s)].
+        total: time integral of all waves that the other end had sent, from the newest packet, scalar
+            [sqrt(J s)].
         budget: energy of these waves, scalar [J].
-        period: scalar [s].
-        end: (8,) state, written.
+        period: control period, scalar [s].
+        end: (8,) state of this end of the channel, written.
 
     Returns:
         The wave [sqrt(W)].
 
-    Source: this module.
+    Source: Niemeyer and Slotine 2004 (wave integrals).
     """
     wave = (total - end[USED_SIGNAL]) / period
     left = max(0.0, budget - end[USED_ENERGY]) / period
@@ -67,15 +72,15 @@ def take_received_wave(total, budget, period, end):
 
 @compiled
 def step_wave_master(v, total, budget, b, period, end):
-    """Compute force and outgoing wave at the master's end.
+    """Compute force and outgoing wave at the master's end of a channel with wave variables.
 
     Args:
         v: speed of the handle, scalar [m/s].
-        total: see `take_received_wave`, scalar.
-        budget: see `take_received_wave`, scalar.
+        total: time integral of the waves that the slave had sent, scalar [sqrt(J s)].
+        budget: energy of these waves, scalar [J].
         b: wave impedance, scalar [N s/m].
-        period: scalar [s].
-        end: (8,) state, written.
+        period: control period, scalar [s].
+        end: (8,) state of this end of the channel, written.
 
     Returns:
         Force against the handle's motion [N], and the wave to send [sqrt(W)].
@@ -91,17 +96,17 @@ def step_wave_master(v, total, budget, b, period, end):
 
 @compiled
 def step_wave_slave(v, total, budget, stiffness, damping, b, period, end):
-    """Compute force and outgoing wave at the slave's end.
+    """Compute force and outgoing wave at the slave's end of a channel with wave variables.
 
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
-        total: see `take_received_wave`, scalar.
-        budget: see `take_received_wave`, scalar.
+        total: time integral of the waves that the master had sent, scalar [sqrt(J s)].
+        budget: energy of these waves, scalar [J].
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
         b: wave impedance, scalar [N s/m].
-        period: scalar [s].
-        end: (8,) state, written.
+        period: control period, scalar [s].
+        end: (8,) state of this end of the channel, written.
 
     Returns:
         Force on the slave [N], and the wave to send back [sqrt(W)].
@@ -122,6 +127,7 @@ def step_wave_slave(v, total, budget, stiffness, damping, b, period, end):
 def step_passivity_master(v, force, budget, mass, period, end):
     """Compute the force at the master's end under passivity control.
 
+    The received force is limited so that no more energy leaves here than has entered at the slave.
     The motion of the mass in the next period is predicted from its speed and the channel's force.
     A hand that pushes as well can still extract too much energy. A damper dissipates this excess in
     the next periods; it is limited so that it at most stops the mass in two periods.
@@ -131,13 +137,13 @@ def step_passivity_master(v, force, budget, mass, period, end):
         force: received force against the handle's motion, scalar [N].
         budget: energy that had entered at the slave at the time of sending, scalar [J].
         mass: mass of the master, scalar [kg].
-        period: scalar [s].
-        end: (8,) state, written; GONE_IN is sent in the next packet.
+        period: control period, scalar [s].
+        end: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
 
     Returns:
-        The applied force [N].
+        The applied force against the handle's motion [N].
 
-    Source: Hannaford and Ryu 2002, solved for the force; see this module.
+    Source: passivity condition of Hannaford and Ryu 2002, solved for the force.
     """
     gone = end[MASTER_FORCE] * v * period
     end[STORED_ENERGY] += gone
@@ -156,7 +162,10 @@ def step_passivity_master(v, force, budget, mass, period, end):
 
 @compiled
 def _damping_force(v, force, power, most):
-    """Return a force that dissipates a power, or the received force if that dissipates more."""
+    """Return a damping force against speed v that dissipates a power, at most `most` times the speed.
+
+    It is the received force `force` if that dissipates more.
+    """
     speed = abs(v)
     if speed == 0.0:
         return 0.0
@@ -169,6 +178,10 @@ def _damping_force(v, force, power, most):
 def step_passivity_slave(v, place, budget, stiffness, damping, min_power, period, end):
     """Compute the force at the slave's end under passivity control.
 
+    The force is that of a spring and damper between the received handle position and the slave. The
+    motion of the reference is limited so that no more energy leaves here than has entered at the
+    master, apart from the power `min_power`.
+
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
         place: position of the handle in the newest packet, scalar [m].
@@ -176,13 +189,13 @@ def step_passivity_slave(v, place, budget, stiffness, damping, min_power, period
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
         min_power: power that is always permitted, scalar [W].
-        period: scalar [s].
-        end: (8,) state, written; GONE_IN is sent in the next packet.
+        period: control period, scalar [s].
+        end: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
 
     Returns:
         Force on the slave [N].
 
-    Source: Ryu, Artigas and Preusche 2010, solved for the reference; see this module.
+    Source: passivity condition of Ryu, Artigas and Preusche 2010, solved for the reference.
     """
     asked = _CATCH_UP_RATE * (end[RECEIVED_POSITION] - end[USED_SIGNAL]) + (place - end[RECEIVED_POSITION]) / period
     end[RECEIVED_POSITION], end[REPORTED_ENERGY] = place, budget

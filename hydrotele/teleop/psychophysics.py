@@ -43,15 +43,16 @@ ComparedQuantity = Literal["stiffness", "force"]
 
 
 class PsychometricFunction(NamedTuple):
-    """Psychometric function of a discrimination experiment.
+    """Psychometric function of a discrimination experiment: response fraction by stimulus level.
 
     Attributes:
-        levels: (n,) comparison over reference, minus 1.
+        levels: (n,) comparison stimulus over reference stimulus, minus 1.
         greater_fraction: (n,) fraction of the trials in which the comparison was reported as greater.
         trials: number of trials per level.
-        jnd: difference with d' = 1 in one interval, relative to the reference.
+        jnd: just noticeable difference, relative to the reference: the standard deviation of one
+            perceived stimulus (d' = 1).
         jnd_error: standard error of `jnd`.
-        bias: level that is perceived as equal to the reference.
+        bias: level at which comparison and reference are perceived as equal.
     """
 
     levels: np.ndarray
@@ -64,7 +65,11 @@ class PsychometricFunction(NamedTuple):
 
 @compiled
 def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
-    """Simulate a handle with `spring` and `load`; write its force and position to `felt`."""
+    """Simulate an operator who moves a handle with stiffness `spring` and opposing force `load`.
+
+    Force [N] and position [m] of the handle in every period are written to `felt` (n, 2). `first` is
+    the index of the first tremor sample.
+    """
     mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
     step = _PERIOD / _SUBSTEPS
     handle = np.zeros(6)
@@ -82,7 +87,10 @@ def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
 
 
 def _make_operator_arm(operator: Operator, hand: HandImpedance, expected: float) -> NeuromuscularState:
-    """Return the operator's arm on axis 0 of a handle with an expected stiffness [N/m]."""
+    """Create the operator's arm and muscles at rest, for a handle of an expected stiffness [N/m].
+
+    The experiment uses axis 0 only.
+    """
     zero = np.zeros(6)
     return flatten_state(NeuromuscularState(
         reference=zero, spring=zero + expected, detent=np.full((3, 6), -1.0), correction=zero,
@@ -97,7 +105,7 @@ def measure_discrimination(
     operator: Operator, hand: HandImpedance, sense: ComparedQuantity = "stiffness", reference: float = 1000.0,
     trials: int = 40, seed: int = 0,
 ) -> PsychometricFunction:  # fmt: skip
-    """Measure the just noticeable difference of an operator.
+    """Measure an operator's just noticeable difference of stiffness or force, by simulated trials.
 
     Args:
         operator: parameters of the operator.
@@ -108,7 +116,7 @@ def measure_discrimination(
         seed: seed of the trials.
 
     Returns:
-        The psychometric function.
+        The psychometric function with the just noticeable difference and its error.
     """
     rng = np.random.default_rng([seed, 1995])
     ticks = round(operator.correction_interval / _PERIOD)
@@ -139,7 +147,10 @@ def measure_discrimination(
 
 
 def _mean_perception(handle: np.ndarray, errors: PerceptionErrors, sense: ComparedQuantity) -> float:
-    """Return the mean perceived quantity in the second half of the exploration."""
+    """Return the mean perceived stiffness [N/m] or force [N] in the second half of an exploration.
+
+    `handle` (n, 2) is force [N] and position [m] in every decision.
+    """
     felt = []
     for number in range(len(errors.force) // 2, len(errors.force)):
         force, x = (float(value) for value in handle[number])
@@ -161,16 +172,17 @@ def _make_tremor(rng: np.random.Generator, count: int) -> np.ndarray:
 def fit_psychometric_function(
     levels: np.ndarray, greater: np.ndarray, trials: int, lapse: float = 0.01
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Fit a cumulative normal to the responses by maximum likelihood.
+    """Fit a psychometric function, a cumulative normal, to responses by maximum likelihood.
 
     Args:
-        levels: (n,) levels of the comparison.
-        greater: (n,) number of trials in which it was reported as greater.
+        levels: (n,) stimulus levels of the comparison.
+        greater: (n,) number of trials in which the comparison was reported as greater.
         trials: number of trials per level.
-        lapse: fraction of accidental responses.
+        lapse: fraction of wrong responses at either end that are independent of the level.
 
     Returns:
-        Mean, standard deviation, and standard error of the standard deviation.
+        Mean and standard deviation of the normal, and standard error of the standard deviation, all in
+        the unit of the levels.
     """
     from scipy.optimize import minimize
     from scipy.special import ndtr

@@ -43,14 +43,17 @@ _STIFFNESS_FACTORS = np.geomspace(1e-3, 1e4, 57)  # tested factors on the task's
 
 
 def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
-    """Return Llewellyn's stability parameter; absolutely stable if it is nowhere below 1.
+    """Return Llewellyn's stability parameter of a two-port at frequencies.
+
+    The two-port is absolutely stable (stable with every passive hand and task) if the parameter is
+    nowhere below 1 and the two-port itself has no unstable pole.
 
     Args:
         port: the two-port.
         s: (...) points on the imaginary axis [rad/s].
 
     Returns:
-        (...) `(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|` [1]; minus infinity where `Re h11` or
+        (...) `(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|` of the hybrid matrix h [1]; minus infinity where `Re h11` or
         `Re h22` is negative, infinity where one direction transmits nothing.
 
     Source: Llewellyn 1952; Haykin 1970, Active network theory; with `[F_h, -V_e] = H [V_h, F_e]`.
@@ -71,7 +74,7 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
 
 def is_absolutely_stable(port: TwoPort) -> bool:
-    """Return whether no passive hand and task make a two-port unstable.
+    """Return whether a two-port is stable with every passive hand and task (absolute stability).
 
     Args:
         port: the two-port.
@@ -90,7 +93,7 @@ def is_absolutely_stable(port: TwoPort) -> bool:
 
 @dataclass(frozen=True)
 class ZWidth:
-    """Range of displayed impedances, and maximum stiffness of the task.
+    """Z-width: range of impedances that a teleoperator displays, and maximum stable task stiffness.
 
     Attributes:
         frequencies: (n,) [rad/s].
@@ -98,7 +101,7 @@ class ZWidth:
         clamped_impedance: (n,) transmitted impedance with a clamped slave [N s/m].
         max_stiffness_held: maximum stable task stiffness with the hand on the handle [N/m]; infinite if
             all tested values are stable, 0 if the softest is unstable.
-        max_stiffness_released: maximum stable task stiffness with the handle released.
+        max_stiffness_released: maximum stable task stiffness with the handle released [N/m].
         max_tested_stiffness: largest tested stiffness [N/m].
     """
 
@@ -111,12 +114,15 @@ class ZWidth:
 
     @property
     def decades(self) -> float:
-        """Mean of `log10 |clamped| / |free|` over the frequency range of hand motion [1]."""
+        """Width of the displayed impedance range in decades, averaged over the frequencies.
+
+        It is the mean of `log10(|Z_clamped| / |Z_free|)` of the two displayed impedances [1].
+        """
         return float(np.mean(np.log10(np.abs(self.clamped_impedance) / np.abs(self.free_impedance))))
 
 
 def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = _HAND_FREQUENCIES) -> ZWidth:
-    """Compute the Z-width of a structure.
+    """Compute the Z-width of a control structure: impedance range and maximum stable task stiffness.
 
     Args:
         case: the teleoperator; the task's stiffness is varied, its mass and damping are kept.
@@ -124,7 +130,7 @@ def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndar
         frequencies: (n,) [rad/s].
 
     Returns:
-        The Z-width.
+        Impedances with free and clamped slave, and maximum stable stiffness of the task.
 
     Raises:
         InputError: the structure is not known.
@@ -158,16 +164,16 @@ def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndar
 
 
 def port_with_task(case: TeleoperatorAxis, structure: str, task: Impedance) -> TwoPort:
-    """Return the structure's two-port with another task."""
+    """Return the linear two-port of a structure, after replacing the task of the case."""
     return replace(case, task=task).make_port(structure)
 
 
 @dataclass(frozen=True)
 class MasterPolynomial:
-    """Characteristic polynomial of the master subsystem alone.
+    """Characteristic polynomial of the master without the slave, and its unstable zeros.
 
     Attributes:
-        coefficients: coefficients of falling powers of s.
+        coefficients: coefficients of falling powers of the complex frequency s.
         unstable_zeros: number of zeros in the right half-plane.
     """
 
@@ -176,10 +182,12 @@ class MasterPolynomial:
 
 
 def master_polynomial(case: TeleoperatorAxis, structure: str, hand: Impedance = _ZERO_IMPEDANCE) -> MasterPolynomial:
-    """Analyse the master without the return channels, held by a hand or released.
+    """Compute the characteristic polynomial of the master without return channels.
 
-    Under position control, and rate control with direct force, `Z_m + C_m + Z_h = 0`. If the
-    master's controller acts on the integral, `Z_m + C_m / (K_v s) + Z_h = 0` and, when released,
+    The master is held by a hand (h) or released. Z_m is the master's impedance and C_m its controller
+    with damping B_mc and stiffness K_mc. Under position control, and rate control with direct force,
+    `Z_m + C_m + Z_h = 0`. If the master's controller acts on the integral,
+    `Z_m + C_m / (K_v s) + Z_h = 0` and, when released,
     `K_v M s^3 + K_v B s^2 + (K_v K + B_mc) s + K_mc = 0` with the master's own M, B and K. Without
     own damping B it cannot be stable. K_v of the source is the inverse of the velocity gain here.
 
@@ -213,7 +221,7 @@ def master_polynomial(case: TeleoperatorAxis, structure: str, hand: Impedance = 
 
 @dataclass(frozen=True)
 class ImpedanceRanges:
-    """Ranges of hands and tasks for random sampling, log-uniform between two impedances.
+    """Ranges of hand and task impedances for random sampling, log-uniform between two impedances.
 
     Attributes:
         hand: minimum and maximum impedance of the hand [kg], [N s/m], [N/m].
@@ -224,7 +232,10 @@ class ImpedanceRanges:
     task: tuple[Impedance, Impedance]
 
     def sample(self, rng: np.random.Generator) -> tuple[Impedance, Impedance]:
-        """Sample a hand and a task; a parameter with a bound of 0 is sampled uniformly."""
+        """Sample the impedances of a hand and a task, in this order.
+
+        Mass, damping and stiffness are log-uniform, or uniform if the minimum is 0.
+        """
         hand, task = (_sample_impedance(least, most, rng) for least, most in (self.hand, self.task))
         return hand, task
 
@@ -236,9 +247,10 @@ _TASK_RANGE_FACTOR = 3.0  # factor between the case's task and the softest and s
 
 
 def case_impedance_ranges(facts: TeleopCaseFile) -> ImpedanceRanges:
-    """Return the ranges of hands and tasks of a case file.
+    """Return the ranges of hand and task impedances of a case file, for random sampling.
 
-    By default the hands are HANDS and the tasks are up to three times softer or stiffer.
+    Without ranges in the file, hands are sampled from DEFAULT_HAND_RANGE, and tasks have between a
+    third and three times the damping and stiffness of the case's task.
 
     Args:
         facts: contents of the case file.
@@ -274,13 +286,14 @@ def _sample_impedance(least: Impedance, most: Impedance, rng: np.random.Generato
 
 @dataclass(frozen=True)
 class SampledStability:
-    """Stability of a structure over sampled hands and tasks.
+    """Stability of a control structure with randomly sampled hands and tasks.
 
     Attributes:
         pair_count: number of sampled pairs of hand and task.
         unstable_count: number of unstable pairs with the hand on the handle.
         unstable_released_count: number of unstable tasks with the handle released.
-        worst_growth_rate: growth rate of the worst pair with the hand on the handle [1/s].
+        worst_growth_rate: growth rate of the worst pair with the hand on the handle, negative if
+            motions decay [1/s].
         worst_hand: hand of the worst pair.
         worst_task: task of the worst pair.
     """
@@ -301,14 +314,16 @@ def evaluate_sampled_pairs(
     pairs: int,
     seed: int = 0,
 ) -> SampledStability:
-    """Evaluate stability over sampled hands and tasks, with sampling and the channel's jitter.
+    """Evaluate the stability of a structure with randomly sampled hands and tasks.
+
+    The stability test includes time sampling and the variable delays of the channel.
 
     Args:
         case: the teleoperator.
         structure: one of `sampled.SAMPLED_STRUCTURES`.
-        line: period and ages of packets.
+        line: control period, and distribution of the ages of received packets.
         spread: ranges of hands and tasks.
-        pairs: number of sampled pairs, the same for every structure.
+        pairs: number of sampled pairs; the same seed gives the same pairs for every structure.
         seed: seed of the random generator.
 
     Returns:
@@ -332,16 +347,19 @@ def evaluate_sampled_pairs(
 
 @dataclass(frozen=True)
 class Robustness:
-    """Robustness of one structure.
+    """Robustness of one control structure by several criteria.
 
     Attributes:
         structure: name of the structure.
-        has_absolute_stability: Llewellyn's criterion; None without a linear two-port.
-        llewellyn: minimum stability parameter [1]; NaN without a linear two-port.
+        has_absolute_stability: whether it is stable with every passive hand and task, by Llewellyn's
+            criterion; None without a linear two-port.
+        llewellyn: minimum of Llewellyn's parameter over frequency [1]; NaN without a linear two-port.
         z_width_result: Z-width, None without a linear two-port.
-        released_polynomial: the released master alone; None for waves and passivity control.
-        sampled: with the hand (with task, without), released (with task, without).
-        sampled_pairs: results over sampled hands and tasks.
+        released_polynomial: polynomial of the released master without the slave; None for wave
+            variables and passivity control.
+        sampled: stability with time sampling, for four pairs: hand and task, hand and no task, no hand
+            and task, neither.
+        sampled_pairs: stability with randomly sampled hands and tasks.
     """
 
     structure: str
@@ -360,17 +378,17 @@ def evaluate_robustness(
     spread: ImpedanceRanges,
     pairs: int = 20,
 ) -> Robustness:
-    """Evaluate the robustness of a structure.
+    """Evaluate the robustness of a control structure against other hands, tasks and release.
 
     Args:
         case: the teleoperator.
         structure: one of `sampled.SAMPLED_STRUCTURES`.
-        line: period and ages of packets.
+        line: control period, and distribution of the ages of received packets.
         spread: ranges of hands and tasks.
         pairs: number of sampled pairs of hand and task.
 
     Returns:
-        Results of all criteria.
+        Results of all criteria: absolute stability, Z-width, release, and sampled hands and tasks.
 
     Raises:
         InputError: the structure is not known.

@@ -1,10 +1,11 @@
-"""One control period of teleoperation: master, communication channel and machine.
+"""One control period of teleoperation: joystick (master), communication channel and machine (slave).
 
 Two compiled functions run before and after the joystick's motion; a third combines them with the
 simulated joystick. Channel delays use ring buffers: a packet that is written at one tick is read
 later by its delay.
 
-The module also converts delays of network packets, which may vary, to the packet ages in use.
+The module also converts the variable delays of network packets to packet ages: how many periods ago
+the packet that a side uses was sent.
 """
 
 import csv
@@ -45,13 +46,16 @@ from hydrotele.teleop.slave import (
 
 
 def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
-    """Return the ages of the newest arrived packets; overtaken packets are dropped.
+    """Return for every period the age of the newest packet that has arrived.
+
+    A packet that arrives after a newer one is dropped.
 
     Args:
-        delays: (n,) delays in periods of the packets sent in periods 0 .. n - 1; negative if lost.
+        delays: (n,) delays, in whole periods, of the packets sent in periods 0 .. n - 1; negative if
+            lost.
 
     Returns:
-        (n,) ages in periods; number of the period plus 1 before the first arrival.
+        (n,) ages in periods. Before the first arrival the age is the number of the period plus 1.
 
     >>> compute_packet_ages(np.array([2, 0, 3, 1, 0])).tolist()  # the first and the third are overtaken
     [1, 0, 1, 2, 0]
@@ -67,14 +71,15 @@ def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
 
 
 def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
-    """Return the ages of arriving packets that are newer than the packet in use.
+    """Return for every period the age of the arriving packet, if it is newer than the one in use.
 
     Args:
-        delays: (n,) see `compute_packet_ages`.
+        delays: (n,) delays, in whole periods, of the packets sent in periods 0 .. n - 1; negative if
+            lost.
 
     Returns:
         (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Before the first
-        arrival it is the longest delay, as if the channel had transmitted zeros.
+        arrival it is the longest delay.
 
     >>> compute_arriving_ages(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
@@ -87,13 +92,13 @@ def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
 
 
 def delays_to_periods(delays: np.ndarray, period: float) -> np.ndarray:
-    """Convert delays [s] to whole periods, -1 for lost packets (NaN)."""
+    """Round packet delays [s] to whole periods; NaN, a lost packet, becomes -1."""
     rounded = np.where(np.isnan(delays), -1.0, np.round(np.nan_to_num(delays) / period))
     return rounded.astype(int)
 
 
 def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read measured network delays.
+    """Read the measured delays of network packets in both directions from a CSV file.
 
     Args:
         path: CSV file with the columns `forward` and `back` [s], one row for every packet in the
@@ -139,14 +144,14 @@ TICKS_PER_CHECK = 20  # ticks between two safety checks
 
 
 class SlaveSide(NamedTuple):
-    """Machine side of teleoperation; k joints of the arm among nu axes.
+    """Arrays of the machine side of teleoperation; k joints of the arm among nu axes.
 
     Attributes:
         joint: (nu,) measured positions [rad] or [m].
         force: (k,) tip force in task coordinates [N], [N m].
         columns: (k,) indices of the arm's joints among the axes.
-        slave: (24 + 14 k,) Slave.
-        state: (102 + 3 k,) SlaveState, written.
+        slave: (24 + 14 k,) SlaveParameters as a flat array.
+        state: (102 + 3 k,) SlaveState as a flat array, written.
     """
 
     joint: np.ndarray
@@ -157,7 +162,7 @@ class SlaveSide(NamedTuple):
 
 
 class ChannelBuffers(NamedTuple):
-    """Communication channel between joystick and machine.
+    """Buffers of the communication channel between joystick and machine.
 
     Attributes:
         forward: (n, 3, 6) ring buffer of the master's packets, written: displacement and rate of
@@ -167,7 +172,8 @@ class ChannelBuffers(NamedTuple):
         packet: (8, k) last packet received by the master, written.
         age: (ticks, 2) age of the arriving packet, forward and back, in ticks; negative if no
             packet arrives that is newer than the last.
-        state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
+        state: (5,) time without a packet from the machine [s] and gain of the packet [1], both written;
+            control period, time without packets after which the gain fades out, and fade-out time [s].
     """
 
     forward: np.ndarray
@@ -178,15 +184,16 @@ class ChannelBuffers(NamedTuple):
 
 
 class MasterSide(NamedTuple):
-    """Operator side of teleoperation: joystick and operator.
+    """Arrays of the operator side of teleoperation: joystick and simulated operator.
 
     Attributes:
-        master: (168,) Master.
-        state: (123,) MasterState, written.
-        qpos: (7,) flotor position [m] and quaternion.
-        muscles: (80,) Muscles, written.
-        past: (reflex + 1, 6) see `compute_muscle_forces`.
-        tremor: (n, 6) see `compute_muscle_forces`.
+        master: (168,) MasterParameters as a flat array.
+        state: (123,) MasterState as a flat array, written.
+        qpos: (7,) flotor position [m] and quaternion, scalar first.
+        muscles: (80,) NeuromuscularState as a flat array, written.
+        past: (d + 1, 6) ring buffer of handle displacements, for a reflex delay of d periods [m],
+            [rad].
+        tremor: (n, 6) tremor forces of the operator [N], [N m].
     """
 
     master: np.ndarray
@@ -199,15 +206,18 @@ class MasterSide(NamedTuple):
 
 @compiled
 def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
-    """Run the first half of a tick: send the machine's packet, compute coil and muscle forces.
+    """Run the first half of a control tick, up to the forces on the joystick's handle.
+
+    The machine's packet is written to the channel, the master receives the newest packet, and the coil
+    currents and the operator's muscle forces are computed. The master's packet is written.
 
     Args:
-        tick: scalar.
+        tick: number of the control tick, scalar.
         fresh: whether the sensors have a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
         tripped: whether the machine has been stopped permanently, scalar.
         machine: SlaveSide.
-        line: Line.
+        line: ChannelBuffers.
         operator: MasterSide.
 
     Returns:
@@ -256,14 +266,16 @@ def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
 
 @compiled
 def step_slave_side(tick, machine, line, grid, table, scale, reference, rate, drive):
-    """Run the second half of a tick: receive the master's packet, write joint and drive references.
+    """Run the second half of a control tick: convert the received packet to references.
+
+    The slave receives the master's packet, and the references of joints and drives are written.
 
     Args:
-        tick: scalar.
+        tick: number of the control tick, scalar.
         machine: SlaveSide.
-        line: Line.
-        grid: (nu, 2) of `drive_tables`.
-        table: (nu, POINTS, 3) of `drive_tables`.
+        line: ChannelBuffers.
+        grid: (nu, 2) lowest joint position and step of the table, from `tabulate_drives`.
+        table: (nu, points, 3) moment arms and chamber volumes, from `tabulate_drives`.
         scale: factor on the drive velocities, scalar.
         reference: (nu,) joint references, those of the arm written [rad] or [m].
         rate: (nu,) rates of the joint references [rad/s] or [m/s].
@@ -314,7 +326,7 @@ STATION_DTYPE = np.dtype(
 
 @compiled
 def _unpack_record(r):
-    """Return SlaveSide, Line and MasterSide as views of a record."""
+    """Return SlaveSide, ChannelBuffers and MasterSide as views of the arrays of a STATION_DTYPE record."""
     k, rows, back = r.joints, r.forward_rows, r.back_rows
     machine = SlaveSide(
         float64_view(r.joint, r.axes), float64_view(r.force, k), int64_view(r.columns, k),
@@ -335,13 +347,16 @@ def _unpack_record(r):
 
 @compiled
 def step_teleoperation(station, flotor, tick, tripped):
-    """Run one tick: first half, a period of the simulated joystick, second half, logging.
+    """Run one control tick of the whole teleoperation loop, and log it.
+
+    The first half (`step_master_side`), one period of the simulated joystick and the second half
+    (`step_slave_side`) follow each other.
 
     Args:
-        station: record of a Station.
+        station: STATION_DTYPE record, with sizes and addresses of all arrays.
         flotor: `SimulatedFlotor.record`, written.
-        tick: scalar.
-        tripped: see `step_master_side`, scalar.
+        tick: number of the control tick, scalar.
+        tripped: whether the machine has been stopped permanently, scalar.
 
     Returns:
         Whether a flag of the slave is set: held at the workspace edge, no packets, valves closed.

@@ -1,9 +1,9 @@
 """Stability of a sampled teleoperator whose packets have variable delays.
 
-Both sides run at the same period T: coils and servo hold their force over a period, rates are
+Both sides, master and slave, run at the same period T: coils and servo hold their force over a period, rates are
 backward differences, integrals are sums. Between samples, master with hand and slave with task are
-masses, dampers and springs, so that one period is an exact map. A packet with an age of n periods
-is the factor `q^n`, `q = 1/z`. With jitter the age changes from period to period; the mean channel
+masses, dampers and springs, so that one period is an exact map. In the z-domain a packet with an age of n periods
+is the factor `q^n`, with the unit delay `q = 1/z`. With jitter the age changes from period to period; the mean channel
 is `E(q) = sum of P(age = n) q^n`. All signals are polynomials of q, and so is the characteristic
 function of the loop. Its zeros inside `|q| < exp(-sigma T)` are the motions that grow faster than
 sigma. They are counted by the winding of the phase along that circle. The effect of jitter beyond
@@ -54,7 +54,7 @@ _RATE_TOLERANCE = 1e-3  # absolute [1/s] and relative tolerance of a growth rate
 
 @dataclass(frozen=True)
 class PacketAges:
-    """Distribution of the ages of packets when they are used.
+    """Control period, and distribution of the ages of packets when they are used.
 
     Attributes:
         period: T of both sides [s].
@@ -68,7 +68,7 @@ class PacketAges:
     back: np.ndarray
 
     def __post_init__(self) -> None:
-        """Raise InputError unless both are probability distributions."""
+        """Raise InputError unless the period is positive and the fractions of each side sum to 1."""
         if not self.period > 0.0:
             raise InputError(_WHERE, f"the period must be positive, got {self.period:g} s")
         for name in ("forward", "back"):
@@ -78,14 +78,14 @@ class PacketAges:
 
     @property
     def mean_ages(self) -> tuple[float, float]:
-        """Mean age of the packets in use, forward and back [s]."""
+        """Mean age of the packets in use, of the forward and of the return channel [s]."""
         ages = (self.period * np.arange(len(p)) @ p for p in (self.forward, self.back))
         forward, back = map(float, ages)
         return forward, back
 
 
 def constant_delay_ages(period: float, delay_forward: float, delay_back: float) -> PacketAges:
-    """Create a channel with constant delays, rounded to periods.
+    """Create the packet ages of a channel with constant delays, rounded to periods.
 
     Args:
         period: T [s].
@@ -103,12 +103,12 @@ def constant_delay_ages(period: float, delay_forward: float, delay_back: float) 
 
 
 def measured_delay_ages(period: float, delays_forward: np.ndarray, delays_back: np.ndarray) -> PacketAges:
-    """Create a channel from the delays of successive packets, one per period.
+    """Create the packet ages of a channel from measured delays of successive packets, one per period.
 
     Args:
         period: T [s].
         delays_forward: (n,) [s]; NaN for a lost packet.
-        delays_back: (m,) [s].
+        delays_back: (m,) the same for packets from the slave [s].
 
     Returns:
         The packet ages; delays are rounded to periods.
@@ -130,7 +130,11 @@ def _age_distribution(delays: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _SampledSide:
-    """A mass with damper and spring under a held force; numerators over `denominator`, at points q."""
+    """Sampled response of a mass with damper and spring to a force that is held for one period.
+
+    The transfer functions from force to position, speed and acceleration are given at points q of the
+    unit delay, as numerators over the common `denominator`.
+    """
 
     denominator: np.ndarray
     position: np.ndarray
@@ -141,15 +145,23 @@ class _SampledSide:
 
     @property
     def rate(self) -> np.ndarray:
-        """Backward difference of the position."""
+        """Numerator of the speed as a controller computes it: backward difference of the position."""
         return self.position * (1.0 - self.q) / self.period
 
     def digital_force(self, z: Impedance) -> np.ndarray:
-        """Return the force of a digital controller: acceleration, differences and positions."""
+        """Return the force of a digital controller with mass, damping and stiffness z.
+
+        It uses sampled positions, their differences, and the measured acceleration; a numerator over
+        `denominator`.
+        """
         return z.mass * self.acceleration + z.damping * self.rate + z.stiffness * self.position
 
     def physical_force(self, z: Impedance) -> np.ndarray:
-        """Return the force of a body that moves with this side, as a sensor measures it."""
+        """Return the force of a body with impedance z that moves with this side, as a sensor measures it.
+
+        It uses true speed and acceleration just before a step of the force; a numerator over
+        `denominator`.
+        """
         return z.mass * self.acceleration + z.damping * self.speed + z.stiffness * self.position
 
 
@@ -170,31 +182,34 @@ def _make_sampled_side(own: Impedance, held: Impedance, period: float, q: np.nda
 
 
 def wave_impedance(case: TeleoperatorAxis) -> float:
-    """Return the wave impedance b [N s/m]; by default the damping of the slave's controller."""
+    """Return the impedance b of the wave variables of a case [N s/m].
+
+    If the case gives none, it is the damping of the slave's controller, or 1 if that is 0 as well.
+    """
     return case.wave or case.slave_control.damping or 1.0
 
 
 def sampled_characteristic(
     case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
 ) -> np.ndarray:
-    """Return the characteristic function of the loop, which is 0 at the poles `z = 1/q`.
+    """Return the characteristic function of the sampled loop at points q of the unit delay.
 
-    The function has no poles.
+    It is 0 at the loop's poles `z = 1/q`, and has no poles itself.
 
     Args:
         case: teleoperator with hand and task; its delays are replaced by those of the channel.
         structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
-        line: period and ages of packets.
-        q: (...) points.
+        line: control period and distribution of the ages of packets.
+        q: (...) complex points.
         reflected: factor on the return channels [1].
 
     Returns:
-        (...).
+        (...) complex values.
 
     Raises:
         InputError: the structure is not known.
 
-    Source: this module's docstring; `two_port.two_port` for the laws.
+    Source: this module's docstring; `two_port.make_two_port` for the control laws.
     """
     if structure not in SAMPLED_STRUCTURES:
         message = f"{structure!r} is not known: {', '.join(SAMPLED_STRUCTURES)}"
@@ -217,7 +232,10 @@ def sampled_characteristic(
 
 
 def _mean_channel_response(share: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Evaluate E(q) by Horner's rule."""
+    """Evaluate the mean channel `E(q) = sum of share[n] q^n` at points q, by Horner's rule.
+
+    `share[n]` is the fraction of the periods in which the packet is n periods old.
+    """
     total = np.zeros_like(q)
     for part in share[::-1]:
         total = total * q + part
@@ -225,12 +243,19 @@ def _mean_channel_response(share: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _mean_return_response(line: PacketAges, q: np.ndarray) -> np.ndarray:
-    """Evaluate E(q) of the return channel if the slave answers packets of the same period."""
+    """Evaluate the mean return channel E(q) if the slave answers packets of the same period.
+
+    A packet from the slave of age 0 then counts as one of age 1.
+    """
     return _mean_channel_response(line.back, q) - line.back[0] * (1.0 - q)
 
 
 def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> tuple[np.ndarray, np.ndarray]:
-    """Return the force on the master and that on the slave; times `1 - q` under rate control."""
+    """Return the forces of the control law that depend on the master's motion.
+
+    They are the force of the master's own controller, and the force on the slave before the channel.
+    Both are numerators over the master's denominator, multiplied by `1 - q` under rate control.
+    """
     firm, own, gains = case.slave_control, case.master_control, case.gains
     if structure not in RATE_STRUCTURES:
         forward = gains.position * near.digital_force(firm)
@@ -251,7 +276,10 @@ def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> 
 
 
 def _slave_law(case: TeleoperatorAxis, structure: str, far: _SampledSide) -> np.ndarray:
-    """Return the force on the master from the slave's signals."""
+    """Return the force on the master that depends on the slave's motion, before the return channel.
+
+    It is a numerator over the slave's denominator.
+    """
     if structure in ("position_force", "rate_force"):
         return -case.gains.force * far.physical_force(case.task)
     back = far.digital_force(case.master_control)
@@ -271,7 +299,11 @@ def _series_characteristic(
     ahead: np.ndarray,
     home: np.ndarray,
 ) -> np.ndarray:
-    """Return the loop of channel and slave controller in series, with or without waves."""
+    """Return the characteristic function if only the slave has a controller and returns its force.
+
+    With `waves` the channel carries wave variables, otherwise velocity and force. `ahead` and `home`
+    are the mean responses of the forward and the return channel.
+    """
     step, firm = 1.0 - near.q, case.slave_control
     held = firm.damping * step + firm.stiffness * near.period  # C = held / step
     if not waves:
@@ -289,16 +321,18 @@ def _series_characteristic(
 
 
 def growth_rate(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
-    """Return the growth rate of the fastest growing motion, negative if all decay, without drift.
+    """Return the growth rate of the fastest growing motion of the sampled loop.
+
+    It is negative if all motions decay; constant positions of a free handle do not count.
 
     Args:
-        case: see `sampled_characteristic`.
-        structure: see `sampled_characteristic`.
-        line: period and ages of packets.
+        case: teleoperator with hand and task; its delays are replaced by those of the channel.
+        structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
+        line: control period and distribution of the ages of packets.
         reflected: factor on the return channels [1].
 
     Returns:
-        sigma of `exp(sigma t)` [1/s].
+        Rate sigma of the motion `exp(sigma t)` [1/s], between -2000 and 2000.
 
     Raises:
         InputError: the structure is not known, or a pole lies on the contour.
@@ -324,7 +358,11 @@ def _find_growth_rate(function, line: PacketAges) -> float:
 
 
 def _count_zeros_inside(function, radius: float, centre: float = 0.0) -> int:
-    """Count the zeros of a function without poles inside a circle with a real centre."""
+    """Count the zeros of a function inside a circle with a real centre, by the argument principle.
+
+    The function has no poles in the circle, and conjugate values at conjugate points. Raise InputError
+    if a zero lies on the circle.
+    """
     angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, _INITIAL_POINTS)])
     values = function(centre + radius * np.exp(1j * angle))
     while True:
@@ -340,16 +378,16 @@ def _count_zeros_inside(function, radius: float, centre: float = 0.0) -> int:
 
 
 def _unit_circle_points() -> np.ndarray:
-    """Return points of the unit circle up to half the sampling rate."""
+    """Return 4000 points q of the unit circle, up to half the sampling frequency."""
     return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
 
 
 def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
-    """Return whether the slave's end of the channel is passive as it is sampled.
+    """Return whether the slave's end of the channel is passive, with sampling taken into account.
 
-    The response of the slave's controller with mass and task from reference velocity to force,
-    `C / (1 + C v_s)`, must have no negative real part up to half the sampling rate, and be stable.
-    A passive channel then cannot make the loop unstable.
+    The response of the slave's end from reference velocity to force is `C / (1 + C v_s)`, with the
+    controller C and the speed v_s of slave and task per force. It must have no negative real part up to
+    half the sampling rate, and be stable. A passive channel then cannot make the loop unstable.
 
     Args:
         case: teleoperator with its task.
@@ -369,7 +407,7 @@ def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
 
 
 def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
-    """Return the transfer functions of master and slave from received to sent signals."""
+    """Return the transfer functions of master and slave from received to sent signal, at points q."""
     near = _make_sampled_side(case.master, case.hand, line.period, q)
     far = _make_sampled_side(case.slave, case.task, line.period, q)
     if structure == WAVE_STRUCTURE:
@@ -387,16 +425,15 @@ def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q:
 def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
     """Return the mean-square loop gain of the noise that jitter causes.
 
-    A signal of frequency w that passes a channel of random age leaves `E(q)` of it, and noise with
-    the fraction `1 - |E(q)|^2` of its power, white if the ages of successive packets are
-    independent.
-    The noise passes the closed loop's transfer functions from either end and causes new noise. The
-    result is the spectral radius of this map of powers.
+    A channel whose packets have random ages transmits the fraction `E(q)` of a signal. It adds noise
+    with the fraction `1 - |E(q)|^2` of the signal's power, which is white if the ages of successive
+    packets are independent. The noise passes the closed loop's transfer functions from either end and
+    causes new noise. The result is the spectral radius of this map of powers.
 
     Args:
         case: teleoperator with hand and task.
-        structure: a linear structure.
-        line: period and ages of packets.
+        structure: one of `SAMPLED_STRUCTURES` except `passivity_control`.
+        line: control period and distribution of the ages of packets.
         reflected: factor on the return channels [1].
 
     Returns:
@@ -421,15 +458,17 @@ def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
 
 
 def slave_characteristic(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray) -> np.ndarray:
-    """Return the characteristic function of slave, controller and task with a held reference.
+    """Return the characteristic function of the slave alone, with a constant reference.
+
+    It contains slave, its sampled controller and task, and is 0 at the poles `z = 1/q`.
 
     Args:
         case: teleoperator with its task.
         line: packet ages, of which only the period is used.
-        q: (...) points.
+        q: (...) complex points of the unit delay.
 
     Returns:
-        (...).
+        (...) complex values.
     """
     far = _make_sampled_side(case.slave, case.task, line.period, np.asarray(q, complex))
     return far.denominator + far.digital_force(case.slave_control)
@@ -437,7 +476,7 @@ def slave_characteristic(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray
 
 @dataclass(frozen=True)
 class StabilityPrediction:
-    """Predicted stability of a sampled structure.
+    """Predicted stability of a teleoperator with sampling and variable delays, and the reason.
 
     Attributes:
         is_stable: whether a disturbance decays; under passivity control, whether it stays bounded.
@@ -453,16 +492,19 @@ class StabilityPrediction:
 def predict_stability(
     case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0
 ) -> StabilityPrediction:
-    """Predict whether a sampled structure is stable.
+    """Predict whether a teleoperator is stable with sampling and variable packet delays.
+
+    Poles and jitter noise determine the stability of linear structures; `passivity_control` needs a
+    stable slave only.
 
     Args:
         case: teleoperator with hand and task.
         structure: one of `SAMPLED_STRUCTURES`.
-        line: period and ages of packets.
+        line: control period and distribution of the ages of packets.
         reflected: factor on the return channels [1].
 
     Returns:
-        The prediction.
+        Whether it is stable, and the criterion that decided.
 
     Raises:
         InputError: the structure is not known, or a pole lies on the contour.
@@ -494,10 +536,10 @@ _BISECTION_TOLERANCE = 1e-9  # relative tolerance of the bisection
 
 
 class HandleBody(NamedTuple):
-    """Mass matrix of a handle in n coordinates, with the spring and damper of the hand.
+    """Linear model of a handle and the hand that holds it, in n coordinates.
 
     Attributes:
-        mass: (n, n) [kg], [kg m], [kg m^2].
+        mass: (n, n) mass matrix of handle and hand [kg], [kg m], [kg m^2].
         stiffness: (n, n) of the hand [N/m], [N m/rad].
         damping: (n, n) of the hand [N s/m], [N m s/rad].
     """
@@ -508,7 +550,7 @@ class HandleBody(NamedTuple):
 
 
 def make_tilting_body(mass: float, arm: float, inertia: float, hand: tuple[float, ...] = (0.0,) * 5) -> HandleBody:
-    """Create a handle that translates and tilts in a vertical plane, x and ry.
+    """Create the model of a handle that translates along x and tilts about y (ry), with a hand.
 
     Args:
         mass: mass of the flotor [kg].
@@ -518,8 +560,7 @@ def make_tilting_body(mass: float, arm: float, inertia: float, hand: tuple[float
             [N m s/rad] and stiffness [N m/rad] of the hand.
 
     Returns:
-        The body, in displacement and rotation of the handle's point.
-        The body, in displacement and turning of the handle's point.
+        The body; its two coordinates are displacement [m] and rotation [rad] of the handle's point.
     """
     m, b, k, rub, spring = hand
     own = np.array([[mass + m, mass * arm], [mass * arm, inertia + mass * arm * arm]])
@@ -527,10 +568,10 @@ def make_tilting_body(mass: float, arm: float, inertia: float, hand: tuple[float
 
 
 def make_spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) -> HandleBody:
-    """Create a handle that only rotates about its own axis.
+    """Create the model of a handle that only rotates about its own axis.
 
     Args:
-        inertia: [kg m^2].
+        inertia: moment of inertia of handle and hand [kg m^2].
         damping: damping of the hand [N m s/rad].
         stiffness: stiffness of the hand [N m/rad].
 
@@ -541,12 +582,14 @@ def make_spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 
 
 
 def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
-    """Return the largest eigenvalue of the sampled loop; below 1 the handle comes to rest.
+    """Return the largest eigenvalue magnitude of a handle under sampled spring and damper control.
+
+    Below 1 the handle comes to rest; the map is that of one control period.
 
     Args:
         body: handle and hand.
         stiffness: (n,) stiffness of the joystick's springs [N/m], [N m/rad].
-        damping: (n,) damping of its dampers [N s/m], [N m s/rad].
+        damping: (n,) damping of the joystick's control [N s/m], [N m s/rad].
         period: control period [s].
 
     Returns:
@@ -578,15 +621,15 @@ def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.nda
 
 
 def max_stable_damping(inertia: float, stiffness: float, period: float) -> float:
-    """Return the maximum damping for which a spinning handle is stable.
+    """Return the maximum sampled damping with which a handle that spins about its axis is stable.
 
     Args:
-        inertia: [kg m^2].
+        inertia: moment of inertia of the handle [kg m^2].
         stiffness: stiffness of the joystick's spring [N m/rad].
         period: control period [s].
 
     Returns:
-        [N m s/rad]; 0 if no damping stabilises this spring.
+        Damping [N m s/rad]; 0 if no damping stabilises this spring.
 
     Source: `max_loop_eigenvalue`; without a spring it is 2 inertia / period.
 
@@ -611,15 +654,15 @@ def max_stable_damping(inertia: float, stiffness: float, period: float) -> float
 
 
 def min_stable_inertia(damping: float, stiffness: float, period: float) -> float:
-    """Return the minimum inertia for which a spinning handle is stable with a damping.
+    """Return the minimum inertia with which a spinning handle is stable at a given sampled damping.
 
     Args:
-        damping: [N m s/rad].
+        damping: damping of the joystick's control [N m s/rad].
         stiffness: stiffness of the joystick's spring [N m/rad].
         period: control period [s].
 
     Returns:
-        [kg m^2]; infinite if there is none below 1e6.
+        Moment of inertia [kg m^2]; infinite if there is none below 1e6.
 
     Source: `max_loop_eigenvalue`; without a spring it is damping period / 2.
 

@@ -43,7 +43,7 @@ _LINEAR, _WAVES, _CONTROLLED = range(3)
 
 
 class KickResponse(NamedTuple):
-    """Response to initial velocities.
+    """Response of a sampled teleoperator to initial velocities of master and slave.
 
     Attributes:
         max_speeds: (40,) maximum of the sum of both speeds in each fortieth of the run [m/s]; 0 after
@@ -61,12 +61,14 @@ class KickResponse(NamedTuple):
 
     @property
     def has_decayed(self) -> bool:
-        """Whether less than a thousandth of the initial speed remains at the end."""
+        """Whether the speeds at the end of the run are below a thousandth of the initial speed."""
         return bool(self.max_speeds[self.max_speeds > 0.0][-1] < 1e-3 * _INITIAL_SPEEDS.max())
 
 
 def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> np.ndarray:
-    """Return the coefficients of the control laws on the signals of each side.
+    """Return the control laws of a structure as coefficients on the seven signals of each side.
+
+    The signals are those that the constants SUM to FORCE of this module number.
 
     Args:
         case: the teleoperator.
@@ -74,8 +76,9 @@ def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: floa
         reflected: factor on the return channels [1].
 
     Returns:
-        (4, 7): own force of the master, force on the slave from the master's packet, own force of
-        the slave, force on the master from the slave's packet.
+        (4, 7) rows: own force of the master, force on the slave from the master's packet, own force of
+        the slave, force on the master from the slave's packet. Own forces are subtracted from the force
+        on a side, forces from packets are added.
 
     Source: Zhu 1994, 3.9-3.62.
     """
@@ -112,7 +115,7 @@ def simulate_kick(
     case: TeleoperatorAxis, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
     reflected: float = 1.0,
 ) -> KickResponse:  # fmt: skip
-    """Simulate the response to initial velocities of master and slave.
+    """Simulate a sampled teleoperator packet by packet, after initial velocities of both sides.
 
     Args:
         case: teleoperator with hand and task; its delays are replaced by the given delays.
@@ -120,7 +123,7 @@ def simulate_kick(
         period: T of both sides [s].
         delays_forward: (n,) delay of the packet sent in each of the n periods of the run [s]; NaN
             if lost.
-        delays_back: (n,) delays of the slave's packets.
+        delays_back: (n,) the same for the slave's packets [s].
         reflected: factor on the return channels [1].
 
     Returns:
@@ -157,7 +160,10 @@ _MIN_GROWTH_RATIO = 1.05  # ratio of late to early motion above which motion gro
 
 
 def _is_growing(largest: np.ndarray) -> bool:
-    """Return whether the last quarter of the run moves more than the second one."""
+    """Return whether the largest speed (40,) of the last quarter of a run exceeds the second one's.
+
+    After an early stop the last speed is compared with the initial one.
+    """
     reached = int(np.count_nonzero(largest > 0.0))
     if reached < _BLOCKS:
         return bool(largest[reached - 1] > _INITIAL_SPEEDS.max())
@@ -166,14 +172,19 @@ def _is_growing(largest: np.ndarray) -> bool:
 
 
 def _has_gained_energy(largest: np.ndarray, given: float) -> bool:
-    """Return whether late motion has more energy than the initial motion."""
+    """Return whether the late kinetic energies of a run exceed the initial one, `given` [J]."""
     late = largest[largest > 0.0][-_BLOCKS // 4 :]
     return bool(late.max() > _MIN_GROWTH_RATIO * given)
 
 
 @compiled
 def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, first):
-    """Return largest speeds (40,) and kinetic energies (40,), and energy in the channel (n,)."""
+    """Integrate master and slave over all n periods, with one packet in each direction per period.
+
+    `way` selects linear control laws, wave variables or passivity control. Return the largest speeds
+    (40,) [m/s] and kinetic energies (40,) [J] of the parts of the run, and the energy that has entered
+    the channel (n,) [J].
+    """
     count = len(age_forward)
     period = numbers[0]
     largest, moving, energy = np.zeros(_BLOCKS), np.zeros(_BLOCKS), np.zeros(count)
@@ -218,7 +229,7 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
 
 @compiled
 def _measure(body, state, force, period, seen):
-    """Sample the sensors of a side just before its force changes."""
+    """Update the seven signals `seen` of a side from its state, just before its force changes."""
     x, v = state[0], state[1]
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
     a = (force - damping * v - stiffness * x) / mass
@@ -237,7 +248,10 @@ PACKET_SIGNAL, PACKET_ENERGY = range(2)
 
 @compiled
 def _read_packet(sent, row, n):
-    """Return sum or signal, and energy, of a packet; zeros before the first arrival."""
+    """Return signal and energy of the packet sent in period `row`, at the latest in period n.
+
+    Both are 0 before the first arrival (`row` negative).
+    """
     if row < 0:
         return 0.0, 0.0
     return sent[min(row, n), PACKET_SIGNAL], sent[min(row, n), PACKET_ENERGY]
@@ -245,7 +259,10 @@ def _read_packet(sent, row, n):
 
 @compiled
 def _step_waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
-    """Run both ends of waves; the master acts first and uses the slave's previous period."""
+    """Compute the forces on master and slave in period n with wave variables, and send packets.
+
+    The master acts first and uses the slave's packet of an earlier period.
+    """
     period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
     total, budget = _read_packet(sent[1], newest_back, n - 1)
     pushed, wave = step_wave_master(seen[0, V], total, budget, b, period, ends[0])
@@ -267,7 +284,10 @@ def _send(sent, n, wave, period):
 
 @compiled
 def _step_passivity_control(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
-    """Run both ends of passivity control; the master acts first, as for waves."""
+    """Compute the forces on master and slave in period n under passivity control, and send packets.
+
+    The master acts first and uses the slave's packet of an earlier period.
+    """
     period, stiffness, damping = numbers[0], numbers[1], numbers[2]
     total, budget = _read_packet(sent[1], newest_back, n - 1)
     force[0] = -step_passivity_master(seen[0, V], total, budget, mass, period, ends[0])
@@ -279,7 +299,11 @@ def _step_passivity_control(n, newest_forward, newest_back, numbers, mass, seen,
 
 @compiled
 def _integrate(body, state, force, period, steps):
-    """Integrate a period with a held force by the fourth-order Runge-Kutta method."""
+    """Integrate the motion of a side over one period with a constant force, by Runge-Kutta steps.
+
+    `body` is mass, damping and stiffness of the side and of the hand or task; `state` is position and
+    speed, written.
+    """
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
     h = period / steps
     x, v = state[0], state[1]

@@ -1,4 +1,6 @@
-"""Slave side of teleoperation: converts the master's packets to safe joint references.
+"""Slave side of teleoperation: converts packets from the joystick to safe joint references.
+
+The slave is the remote machine, the master the joystick.
 
 Under rate control the handle displacement beyond the dead band commands the rate of the task
 coordinates, under position control their position. Limits of speed and acceleration keep the
@@ -69,10 +71,10 @@ HANDLE, HANDLE_SPEED, HAND = range(3)  # with a passive channel: handle, sum or 
 
 
 class SlaveParameters(NamedTuple):
-    """Parameters of the slave side, for k joints and task coordinates.
+    """Parameters of the slave side, for an arm with k joints and k task coordinates.
 
     Attributes:
-        arm: (9,) of `kinematics.task.arm_parameters`.
+        arm: (9,) geometry of the arm, from `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
         table: (k, 12) parameters of every coordinate: joystick axis (-1 without), sign, gain, dead
@@ -81,7 +83,8 @@ class SlaveParameters(NamedTuple):
             [N] or [N m], wave impedance [N s/m].
         limits: (5,) packet timeout [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
             mass [kg], phase lead of the drives [s].
-        kind: (5,) of `master.Master.kind`, then 1 if the inverse Jacobian resolves the motion.
+        kind: (5,) the four elements of `MasterParameters.kind`, then 1 if the inverse Jacobian
+            resolves the motion.
     """
 
     arm: np.ndarray
@@ -93,21 +96,23 @@ class SlaveParameters(NamedTuple):
 
 
 class SlaveState(NamedTuple):
-    """State and references of the slave side.
+    """State of the slave side, with the references that it computes every control period.
 
     Attributes:
         pose: (5,) reference pose [m], [rad].
-        rate: (5,) rate of the reference pose.
+        rate: (5,) rate of the reference pose [m/s], [rad/s].
         joint: (k,) joint references [rad].
         joint_rate: (k,) rates of the joint references [rad/s].
         ahead: (k,) joint rates with phase lead, for the delay of the valves [rad/s].
-        measured: (2, 5) pose of the measured joints and its filtered rate.
-        command: (3, 6) last packet: handle, its rate, hand force.
-        force_integral: (5,) integral of the hand force, for four channels under rate control.
+        measured: (2, 5) measured pose of the tip and its filtered rate.
+        command: (3, 6) last packet: displacement of the handle, its rate, hand force.
+        force_integral: (5,) integral of the rate gain times the hand force, for four channels under
+            rate control.
         asked: (5,) integral of the commanded rate, for four channels under rate control [m], [rad].
         flags: (4,) whether the reference is held at the workspace edge, no packets arrive, the
             valves are closed permanently; age of the last packet [s].
-        line: (5, 10) see `master.MasterState.line`, in the scale of the handle.
+        line: (5, 10) end of a passive channel for each coordinate, elements as in `MasterState.line`,
+            in the scale of the handle.
     """
 
     pose: np.ndarray
@@ -125,16 +130,16 @@ class SlaveState(NamedTuple):
 
 @compiled
 def unpack_slave(flat, k):
-    """Return the parts of `flat_view(Slave)`.
+    """Return the fields of SlaveParameters as views of a flat array.
 
     Args:
-        flat: (24 + 14 k,) array.
+        flat: (24 + 14 k,) array, as from `flat_view` of a SlaveParameters.
         k: number of joints, scalar.
 
     Returns:
-        Slave, views of it.
+        SlaveParameters.
 
-    Source: order and shapes of Slave.
+    Source: order and shapes of SlaveParameters.
     """
     arm, rest = split_array(flat, 9)
     ranges, rest = split_array(rest, 2 * k)
@@ -146,14 +151,14 @@ def unpack_slave(flat, k):
 
 @compiled
 def unpack_slave_state(flat, k):
-    """Return the parts of `flat_view(SlaveState)`.
+    """Return the fields of SlaveState as views of a flat array.
 
     Args:
-        flat: (102 + 3 k,) array.
+        flat: (102 + 3 k,) array, as from `flat_view` of a SlaveState.
         k: number of joints, scalar.
 
     Returns:
-        SlaveState, views of it.
+        SlaveState.
 
     Source: order and shapes of SlaveState.
     """
@@ -197,7 +202,7 @@ def build_slave(
         lead: phase lead of the drives' velocities [s].
 
     Returns:
-        Parameters and state.
+        Parameters, and a state with references at the initial pose.
 
     Raises:
         InputError: the machine has no arm.
@@ -229,11 +234,11 @@ def build_slave(
 
 @compiled
 def measure_tip(numbers, joint, fresh, elapsed, s):
-    """Compute pose and rate of the tip from measured joint angles.
+    """Compute pose and filtered rate of the tip from measured joint angles.
 
     Args:
-        numbers: Slave.
-        joint: (k,) measured [rad].
+        numbers: SlaveParameters.
+        joint: (k,) measured joint angles [rad].
         fresh: whether there is a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
         s: SlaveState; `measured` is written.
@@ -259,15 +264,18 @@ def measure_tip(numbers, joint, fresh, elapsed, s):
 
 @compiled
 def update_references(numbers, packet, arrived, force, joint, period, s):
-    """Compute the joint references of this period from the master's packet.
+    """Compute the joint references of this control period from the master's packet.
+
+    The handle commands rates of the task coordinates, which are limited in speed and acceleration and
+    resolved to the joints. Without packets the rates go to zero.
 
     Args:
-        numbers: Slave.
+        numbers: SlaveParameters.
         packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
         arrived: whether a packet arrived in this period, scalar.
         force: (k,) force of the environment on the tip, task coordinates [N], [N m].
         joint: (k,) measured joints, at which an inverse Jacobian is evaluated [rad].
-        period: scalar [s].
+        period: control period, scalar [s].
         s: SlaveState; references and flags are written.
 
     Returns:
@@ -333,7 +341,11 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
 
 @compiled
 def _commanded_rate(numbers, row, c, x, v, hand, force, period, s):
-    """Return the rate of a coordinate that the handle commands."""
+    """Return the rate [m/s] or [rad/s] of task coordinate c that the master commands.
+
+    `x` and `v` are displacement and rate of the handle and `hand` its force, with the sign of the
+    coordinate; `force` is the contact force. The mode and the structure of the control select the law.
+    """
     if numbers.kind[0] == FOUR_CHANNEL:
         return _four_channel_rate(numbers, row, c, x, v, hand, force, period, s)
     if numbers.kind[0] == WAVE_VARIABLES or numbers.kind[0] == PASSIVITY_CONTROL:
@@ -348,9 +360,10 @@ def _commanded_rate(numbers, row, c, x, v, hand, force, period, s):
 
 @compiled
 def _position_control_rate(numbers, row, c, x, period, s):
-    """Return the rate under position control: a critically damped filter of the handle.
+    """Return the rate of coordinate c that moves the tip to the position that the handle commands.
 
-    Over long distances it moves at maximum speed and brakes within the acceleration limit.
+    It is that of a critically damped second-order filter of the handle. Over long distances it moves at
+    maximum speed and brakes within the acceleration limit.
     """
     gap = row[AXIS_GAIN] * x - (s.pose[c] - numbers.start[c])
     size = abs(gap)
@@ -365,10 +378,12 @@ def _position_control_rate(numbers, row, c, x, period, s):
 
 @compiled
 def _four_channel_rate(numbers, row, c, x, v, hand, force, period, s):
-    """Return the rate of the four-channel virtual slave, moved by hand, task and master position.
+    """Return the rate of coordinate c with four channels: that of a virtual mass M.
 
+    Hand force, contact force F and a spring K and damper B to the handle's position x move the mass.
     Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
-    under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
+    under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`; y is the
+    position of the coordinate and k_v the rate gain.
     """
     gain, spring, damper = row[AXIS_GAIN], row[SPRING], row[DAMPER]
     mass = numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
@@ -389,7 +404,11 @@ def _four_channel_rate(numbers, row, c, x, v, hand, force, period, s):
 
 @compiled
 def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
-    """Return the virtual slave's rate at a passive channel: `M z'' = pull + ratio F`."""
+    """Return the rate of coordinate c with a passive channel: that of a virtual mass M.
+
+    The force `pull` of the channel's slave end and the scaled contact force F move the mass:
+    `M z'' = pull + ratio F`. `total` and `budget` are signal and energy of the received packet.
+    """
     gain, spring, damper, end = row[AXIS_GAIN], row[SPRING], row[DAMPER], s.line[c]
     speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
     if numbers.kind[0] == WAVE_VARIABLES:
@@ -410,11 +429,11 @@ def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
 
 @compiled
 def check_following_error(numbers, joint, s):
-    """Close the valves permanently if a joint does not follow its reference.
+    """Close the valves permanently if a joint is too far from its reference.
 
     Args:
-        numbers: Slave.
-        joint: (k,) measured [rad]; a value that is not finite also closes the valves.
+        numbers: SlaveParameters.
+        joint: (k,) measured joint angles [rad]; a value that is not finite also closes the valves.
         s: SlaveState; `flags` is written.
 
     Returns:
@@ -429,18 +448,21 @@ def check_following_error(numbers, joint, s):
 
 @compiled
 def write_machine_packet(numbers, force, s, packet):
-    """Write the machine's packet: force, and positions and speeds relative to the start.
+    """Write the packet from the machine to the master: tip force, positions and speeds.
+
+    Positions are relative to the start. A passive channel replaces the reference by signal and energy
+    of the channel; with four channels the reference replaces the measured motion.
 
     Args:
-        numbers: Slave.
+        numbers: SlaveParameters.
         force: (k,) tip force in task coordinates [N], [N m].
         s: SlaveState.
-        packet: (8, k) written, except for the last three rows.
+        packet: (8, k) written, except for the last three rows, the task impedance.
 
     Returns:
         Nothing.
 
-    Source: this module.
+    Source: rows TIP_FORCE to REFERENCE_SPEED of `teleop.master`.
     """
     for c in range(len(force)):
         packet[TIP_FORCE, c] = force[c]
@@ -464,21 +486,21 @@ def write_machine_packet(numbers, force, s, packet):
 
 @compiled
 def step_slave(numbers, packet, arrived, force, joint, period, s):
-    """Run one period of the slave side: joint references and following-error check.
+    """Run one control period of the slave side: joint references and following-error check.
 
     Args:
-        numbers: Slave.
-        packet: (3, 6) see `update_references`.
-        arrived: see `update_references`, scalar.
-        force: (k,) see `update_references`.
-        joint: (k,) measured [rad].
-        period: scalar [s].
+        numbers: SlaveParameters.
+        packet: (3, 6) displacement of the handle [m], [rad], its rate, and the hand's force [N], [N m].
+        arrived: whether a packet arrived in this period, scalar.
+        force: (k,) force of the environment on the tip, task coordinates [N], [N m].
+        joint: (k,) measured joint angles [rad].
+        period: control period, scalar [s].
         s: SlaveState, written.
 
     Returns:
         Nothing.
 
-    Source: this module.
+    Source: `update_references` and `check_following_error` in turn.
     """
     update_references(numbers, packet, arrived, force, joint, period, s)
     check_following_error(numbers, joint, s)

@@ -76,7 +76,7 @@ _TASK_UNITS = {"r": ("m", "N"), "theta": ("rad", "N m"), "z": ("m", "N"), "attit
 
 
 class TeleoperationLog:
-    """Recorded signals of a run of n ticks.
+    """Recorded signals of the teleoperation loop in a run of n control ticks.
 
     Attributes:
         coordinates: k task coordinates.
@@ -86,7 +86,7 @@ class TeleoperationLog:
     """
 
     def __init__(self, ticks: int, coordinates: tuple[str, ...], m: MasterState, s: SlaveState) -> None:
-        """Allocate the arrays.
+        """Allocate the arrays for the signals of a run.
 
         Args:
             ticks: number of control ticks.
@@ -102,30 +102,30 @@ class TeleoperationLog:
         self.touching = np.zeros(ticks, np.int64)
 
     def tick_arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays to which `round_trip` writes a row per tick."""
+        """Return name -> array to which the compiled loop (`step_teleoperation`) writes a row per tick."""
         return {"log_master": self._master, "log_slave": self._slave, "log_force": self.force,
                 "log_muscles": self.muscles, "touching": self.touching}  # fmt: skip
 
     def truncate(self, ticks: int) -> None:
-        """Keep only the first ticks."""
+        """Discard all rows after the first `ticks`, for a run that ended early."""
         self._master, self._slave = self._master[:ticks], self._slave[:ticks]
         self.force, self.muscles = self.force[:ticks], self.muscles[:ticks]
         self.touching = self.touching[:ticks]
 
     def master(self, name: str) -> np.ndarray:
-        """Return a field of MasterState, (n, ...), such as `handle`."""
+        """Return the recorded history (n, ...) of a field of MasterState, such as `handle`."""
         return _state_field(self._master, self._m, name)
 
     def slave(self, name: str) -> np.ndarray:
-        """Return a field of SlaveState, (n, ...), such as `pose`."""
+        """Return the recorded history (n, ...) of a field of SlaveState, such as `pose`."""
         return _state_field(self._slave, self._s, name)
 
     def channels(self, every: int, rows: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """Return the channels of the measured log.
+        """Return the recorded signals as channels of the run's log, at the rate of the log.
 
         Args:
-            every: control ticks per row.
-            rows: number of rows.
+            every: control ticks per row of the log.
+            rows: number of rows of the log.
 
         Returns:
             (channel -> (rows,), channel -> unit).
@@ -167,7 +167,7 @@ _FADE_TIME = 0.2  # s, fade-out time of the reflected force when no packets arri
 
 
 class TeleoperationSystem:
-    """Closed-loop teleoperation system of one run.
+    """Teleoperation loop of one run: operator, joystick, channel and references of the machine.
 
     Attributes:
         coordinates: task coordinates of the arm.
@@ -180,7 +180,7 @@ class TeleoperationSystem:
         self, plant: Plant, data: mujoco.MjData, scenario: Scenario, plan: Plan,
         drives: DriveReferences, feedback: Feedback, hand_input: HandInput | None = None,
     ) -> None:  # fmt: skip
-        """Build the loop for a run.
+        """Build the teleoperation loop for a run of a scenario.
 
         Args:
             plant: the simulated machine.
@@ -239,7 +239,7 @@ class TeleoperationSystem:
         self._fill_record(swing, scenario.servo.feedforward)
 
     def _collect_arrays(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
-        """Return the arrays whose addresses `round_trip` uses."""
+        """Return name -> array whose memory address the compiled loop (`step_teleoperation`) uses."""
         plan, data, line = self._plan, self._data, self._line
         grid, table = tabulate_drives(machine, plan.axes)
         assert plan.pose is not None
@@ -256,7 +256,11 @@ class TeleoperationSystem:
         }  # fmt: skip
 
     def _fill_record(self, swing: int, scale: float) -> None:
-        """Set the sizes of the arrays, the cab's degree of freedom and the drive velocity scale."""
+        """Write the sizes of all arrays and the settings of the run to the record of the compiled loop.
+
+        `swing` is the degree of freedom that moves the cab with the joystick, -1 for a fixed joystick;
+        `scale` is the factor on the drive velocities.
+        """
         sizes = {name: len(array) for name, array in self._arrays.items()}
         for name, value in {
             "axes": sizes["joint"], "joints": sizes["columns"], "ticks": sizes["reference"],
@@ -273,9 +277,9 @@ class TeleoperationSystem:
             self._record[name] = value
 
     def attach_device(self, exchange: DeviceExchange) -> None:
-        """Replace the simulated joystick by a real device.
+        """Replace the simulated joystick by a real haptic device.
 
-        The device's own loop computes its force; here the same law runs again, for the logs.
+        The device's own loop computes its force; here the same control law runs again, for the logs.
 
         Args:
             exchange: called once per control tick, see `DeviceExchange`.
@@ -295,7 +299,7 @@ class TeleoperationSystem:
 
     @property
     def packet(self) -> np.ndarray:
-        """Last packet from the machine (rows, k), see `teleop.master`."""
+        """Last packet (8, k) from the machine that the master received, rows as in `teleop.master`."""
         return self._line.packet
 
     @property
@@ -304,7 +308,10 @@ class TeleoperationSystem:
         return self._master.axis[:, [DEADBAND, HANDLE_RANGE]].T
 
     def prepare_tick(self, tick: int) -> None:
-        """Run the Python part of a tick before `round_trip`: estimate, decide, exchange data.
+        """Run the Python part of a control tick, before the compiled part (`step_teleoperation`).
+
+        It applies sensor faults, updates the force estimate and the tip-over protection, exchanges
+        data with a real device, and lets the simulated operator decide.
 
         Args:
             tick: number of the control tick.
@@ -329,7 +336,7 @@ class TeleoperationSystem:
             operator.decide(tick)
 
     def next_prepared_tick(self, tick: int) -> int:
-        """Return the next tick that needs `prepare_tick`."""
+        """Return the next control tick after `tick` that needs `prepare_tick`."""
         if self._exchange or self._every_tick:
             return tick + 1
         every = math.gcd(self.operator.ticks_per_decision, self._feedback.ticks_per_sample)
@@ -339,18 +346,22 @@ class TeleoperationSystem:
         """Run the safety checks before the machine moves; return whether to close the valves.
 
         Args:
-            tick: one for which `round_trip` returned true, or a multiple of `TICKS_PER_CHECK`.
+            tick: control tick for which `step_teleoperation` returned true, or a multiple of
+                `TICKS_PER_CHECK`.
         """
         self._update_trip(tick)
         return self.valves_closed
 
     @property
     def records(self) -> tuple[np.ndarray, np.ndarray]:
-        """Records of station and simulated joystick for `round_trip`."""
+        """Memory records of this loop and of the simulated joystick for `step_teleoperation`."""
         return self._record, self._flotor.record
 
     def _update_forces(self, fresh: bool) -> None:
-        """Update the tip force, and the task impedance if it is reflected."""
+        """Update the estimated or exact tip force, and the estimated task impedance if reflected.
+
+        `fresh` is true if the sensors have a new sample.
+        """
         seen = self._feedback
         if self._force_estimator and fresh:
             self._force_estimator.update(seen.joint, seen.head, seen.rod)
@@ -364,7 +375,7 @@ class TeleoperationSystem:
             self._line.back[:, TASK_MASS] = self._task_estimator.mass
 
     def summary(self) -> dict[str, float | int | bool | None]:
-        """Return statistics of the run: handle energy, currents, largest displacements, trips."""
+        """Return statistics of the run: handle energy, coil currents, largest values, closed valves."""
         handle, energy = np.abs(self.log.master("handle")), self._m.energy
         return {
             "handle_energy_J": float(energy[0]),
@@ -379,7 +390,10 @@ class TeleoperationSystem:
         }
 
     def _update_trip(self, tick: int) -> None:
-        """Close the valves if a check fails, and report the reason once."""
+        """Request closed valves if a joint lags its reference or a sensor is constant.
+
+        The reason, missing packets and the workspace edge are added to `notes`, each once.
+        """
         now, s = tick * self._period, self._s
         if s.flags[HELD_AT_EDGE] and "edge" not in self._noted_keys:
             self._add_note("edge", f"resolved motion held at the edge of the workspace at {now:.2f} s")
@@ -402,7 +416,11 @@ class TeleoperationSystem:
         self.notes.append(sentence)
 
     def _update_true_force(self) -> None:
-        """Write the simulator's contact force in task coordinates, without moments of the tool."""
+        """Write the simulator's exact contact force on the tip, in task coordinates.
+
+        Radial force [N], moment about the swing axis [N m] and vertical force [N]; moments of the tool
+        stay 0.
+        """
         self._force[:] = 0.0
         if not self._data.ncon:
             return
@@ -415,7 +433,7 @@ class TeleoperationSystem:
 
 
 class _FrozenSensor:
-    """Freeze the reading of a sensor from a given time on."""
+    """Simulated sensor fault: a sensor repeats its reading from a given time on."""
 
     def __init__(self, fault: SensorFault, axes: tuple[str, ...]) -> None:
         kind, _, axis = fault.channel.partition(".")
@@ -428,7 +446,7 @@ class _FrozenSensor:
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
-        """Replace the live reading by the frozen one."""
+        """Replace the reading in `seen` by the frozen one, if the fault has started at `time` [s]."""
         readings = getattr(seen, self._name)
         if time < self._start_time:
             return
@@ -447,7 +465,10 @@ def _make_force_estimator(
     period: float,
     sensors: SensorSet | None,
 ) -> EndpointForce | None:
-    """Create the estimator of the tip force; None if neither force nor sensor checks need it."""
+    """Create the estimator of the tip force from the drive pressures.
+
+    Return None if the exact force is used and no sensor has to be checked.
+    """
     if pilot.force == "true" and sensors is None:
         return None
     kind = "static" if pilot.force == "true" else pilot.force
@@ -462,7 +483,10 @@ def _force_bandwidth_hz(pilot: TeleopPilot) -> float:
 
 
 def _make_task_estimator(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
-    """Create the estimator of the task impedance; None if it is not reflected."""
+    """Create the estimator of the task's mass, damping and stiffness for `reflection: impedance`.
+
+    Return None for other reflections; k is the number of task coordinates.
+    """
     if pilot.reflection != "impedance":
         return None
     bands = (2.0 * _force_bandwidth_hz(pilot), _force_bandwidth_hz(pilot))
@@ -470,13 +494,16 @@ def _make_task_estimator(pilot: TeleopPilot, seen: Feedback, period: float, k: i
 
 
 def _joystick_path(scenario: Scenario, name: str) -> str:
-    """Return a joystick's file, relative to the scenario's folder."""
+    """Return the path of the scenario's own joystick file, or the name of a shipped joystick."""
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
 
 
 def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> ChannelBuffers:
-    """Create empty delay buffers, and the ages of arriving packets."""
+    """Create the channel's buffers, with the ages of arriving packets from delays, jitter and losses.
+
+    Raise InputError for a delay that is not shorter than the run.
+    """
     channel, period = pilot.channel, 1.0 / scenario.control_rate
     for name in ("delay_forward", "delay_back"):
         if (delay := getattr(channel, name)) >= scenario.duration:
@@ -497,7 +524,10 @@ def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> Cha
 
 
 def _packet_delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
-    """Return the delays of all packets in ticks (ticks, 2), forward and back; -1 if lost."""
+    """Return the delays (ticks, 2) of all packets of a run, forward and back, in control ticks.
+
+    They are constant, random with jitter, or from a trace file. Lost packets of a trace are -1.
+    """
     ticks = scenario.tick_count
     if channel.trace:
         path = Path(scenario.folder, channel.trace)

@@ -23,14 +23,14 @@ _MAX_STEPS = 10_000_000
 
 @dataclass(frozen=True)
 class StiffnessAxis:
-    """A joystick axis whose stiffness follows a force.
+    """A joystick axis whose stiffness follows a force within bounds (stiffness feedback).
 
     Attributes:
-        mass: M [kg].
-        damping: B [N s/m].
+        mass: mass M of the moving part [kg].
+        damping: damping B [N s/m].
         nominal_stiffness: stiffness without contact [N/m].
-        min_stiffness: K_min [N/m].
-        max_stiffness: K_max [N/m].
+        min_stiffness: lower bound K_min of the stiffness [N/m].
+        max_stiffness: upper bound K_max of the stiffness [N/m].
     """
 
     mass: float
@@ -50,7 +50,7 @@ class StiffnessAxis:
             )  # fmt: skip
 
     def with_hand(self, hand: Impedance) -> "StiffnessAxis":
-        """Return the axis held by a hand, whose mass, damper and spring are added."""
+        """Return a copy of the axis with the mass, damping and stiffness of a hand added."""
         stiff = hand.stiffness
         return StiffnessAxis(
             self.mass + hand.mass, self.damping + hand.damping, self.nominal_stiffness + stiff,
@@ -59,14 +59,18 @@ class StiffnessAxis:
 
     @property
     def theorem_margin(self) -> float:
-        """`B^2 - 4 M K_max` [(N s/m)^2]; sufficient if positive and K_min > 0 (Zhu 1994, 4.14)."""
+        """Margin `B^2 - 4 M K_max` of the stability theorem of stiffness feedback [(N s/m)^2].
+
+        The axis is stable with every change of the stiffness if the margin and K_min are positive; the
+        condition is sufficient, not necessary (Zhu 1994, 4.14).
+        """
         return stiffness_margin(self.mass, self.damping, self.max_stiffness)
 
     @property
     def stability_criterion(self) -> str:
-        """Criterion that proves stability: `theorem`, `switching bound`, or `nothing`.
+        """Name of the criterion that proves stability: `theorem`, `switching bound`, or `nothing`.
 
-        Theorem 4-2 requires `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound
+        Theorem 4-2 (Zhu 1994) requires `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound
         requires that the motion under the worst switching decays, which is necessary and
         sufficient.
         """
@@ -76,7 +80,10 @@ class StiffnessAxis:
 
     @property
     def min_stable_damping(self) -> float:
-        """Damping at which motion under the worst switching neither grows nor decays [N s/m]."""
+        """Damping at which motion under the worst stiffness switching keeps its size [N s/m].
+
+        More damping makes it decay. The value is infinite if the minimum stiffness is 0.
+        """
         if self.min_stiffness <= 0.0:
             return math.inf
         if self.min_stiffness == self.max_stiffness:
@@ -91,26 +98,27 @@ class StiffnessAxis:
 
     @property
     def half_swing_growth(self) -> float:
-        """Speed ratio over half a swing, see `worst_switching_growth`."""
+        """Factor by which the worst switching changes the speed in half a swing [1]; stable below 1."""
         return worst_switching_growth(self.mass, self.damping, self.min_stiffness, self.max_stiffness)
 
     @property
     def theorem_damping(self) -> float:
-        """Minimum damping for which the theorem holds [N s/m]."""
+        """Damping above which the stability theorem holds, `2 sqrt(M K_max)` [N s/m]."""
         return 2.0 * math.sqrt(self.mass * self.max_stiffness)
 
 
 def worst_switching_growth(mass: float, damping: float, least: float, most: float) -> float:
-    """Return the growth of the speed over half a swing under the worst switching.
+    """Return the growth of a spring's speed over half a swing, under the worst stiffness switching.
 
-    The motion is linear between switches, so that every half swing grows by the same factor. Below
-    1 the axis comes to rest for any change of the stiffness.
+    The stiffness is lowest while the mass moves outwards, and highest while it returns. The motion is
+    linear between switches, so that every half swing grows by the same factor. Below 1 the axis comes
+    to rest for any change of the stiffness.
 
     Args:
-        mass: M [kg].
-        damping: B [N s/m].
-        least: stiffness outwards, K_min [N/m].
-        most: stiffness inwards, K_max [N/m].
+        mass: mass of the axis [kg].
+        damping: damping of the axis [N s/m].
+        least: stiffness outwards, the lower bound K_min [N/m].
+        most: stiffness inwards, the upper bound K_max [N/m].
 
     Returns:
         Speed through the centre relative to that half a swing earlier [1]; 0 if it does not return
@@ -130,16 +138,16 @@ def worst_switching_growth(mass: float, damping: float, least: float, most: floa
 
 
 def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
-    """Compute the growth over half a swing on a grid of damping and K_max.
+    """Compute the speed growth under the worst switching on a grid of damping and upper stiffness.
 
     Args:
-        mass: M [kg].
-        least: K_min [N/m].
-        dampings: (n,) B [N s/m].
-        stiffest: (m,) K_max [N/m], none below K_min.
+        mass: mass of the axis [kg].
+        least: lower bound K_min of the stiffness [N/m].
+        dampings: (n,) dampings [N s/m].
+        stiffest: (m,) upper bounds K_max of the stiffness [N/m], none below K_min.
 
     Returns:
-        (m, n), see `worst_switching_growth`.
+        (m, n) growth of the speed over half a swing [1]; the axis is stable below 1.
     """
     return np.array([[worst_switching_growth(mass, b, least, k) for b in dampings] for k in stiffest])
 

@@ -1,7 +1,8 @@
 """Bilateral teleoperator as a linear two-port: transparency, passivity and stability.
 
-Master and slave are masses, `Z = M s`, with controllers `C = B + K/s`; four channels join them:
-velocity forward C1, force back C2, force forward C3, velocity back C4. The ports are the hand's
+The operator's hand moves the master, and the slave acts on the environment (task). Both are masses,
+`Z = M s`, with controllers `C = B + K/s`; four channels join them: velocity forward C1, force back C2,
+force forward C3, velocity back C4. s is the complex frequency. The ports are the hand's
 force and velocity and the environment's. The number of unstable poles of the loop with hand, task
 and delays follows from the Nyquist criterion.
 """
@@ -26,9 +27,9 @@ class Impedance:
     """Force over velocity of a mass, a damper and a spring, `M s + B + K/s`.
 
     Attributes:
-        mass: M [kg].
-        damping: B [N s/m].
-        stiffness: K [N/m].
+        mass: mass M [kg].
+        damping: damping B [N s/m].
+        stiffness: stiffness K [N/m].
     """
 
     mass: float = 0.0
@@ -36,23 +37,25 @@ class Impedance:
     stiffness: float = 0.0
 
     def __call__(self, s: np.ndarray) -> np.ndarray:
-        """Return the impedance [N s/m] at complex frequencies [rad/s]."""
+        """Return the complex impedance, force per velocity [N s/m], at complex frequencies s [rad/s]."""
         return self.mass * s + self.damping + self.stiffness / s
 
 
 @dataclass(frozen=True)
 class TwoPort:
-    """Two-port of a teleoperator.
+    """Linear two-port of a teleoperator: both sides, their controllers, four channels and delays.
+
+    Blocks are transfer functions of the complex frequency s [rad/s].
 
     Attributes:
         master: impedance of the master.
         slave: impedance of the slave.
-        master_control: C_m, the master's controller on its own velocity.
-        slave_control: C_s, the slave's controller on its own velocity.
-        velocity_forward: C1.
-        force_back: C2.
-        force_forward: C3.
-        velocity_back: C4.
+        master_control: C_m, the master's controller on its own velocity [N s/m].
+        slave_control: C_s, the slave's controller on its own velocity [N s/m].
+        velocity_forward: C1, force on the slave per master velocity [N s/m].
+        force_back: C2, force against the master per environment force [1].
+        force_forward: C3, force on the slave per hand force [1].
+        velocity_back: C4, force against the master per slave velocity [N s/m].
         delay_forward: delay from the master to the slave [s].
         delay_back: delay from the slave to the master [s].
     """
@@ -69,7 +72,7 @@ class TwoPort:
     delay_back: float = 0.0
 
     def channels(self, s: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return C1 .. C4 at complex frequencies, with their delays."""
+        """Evaluate the channels C1, C2, C3, C4 at complex frequencies s, with their delays."""
         late, back = np.exp(-s * self.delay_forward), np.exp(-s * self.delay_back)
         return (
             self.velocity_forward(s) * late, self.force_back(s) * back,
@@ -79,7 +82,7 @@ class TwoPort:
 
 @dataclass(frozen=True)
 class StructureGains:
-    """Gains of the channels of a structure.
+    """Gains of the channels between master and slave.
 
     Attributes:
         position: slave position per master position [1].
@@ -97,7 +100,7 @@ def make_two_port(
     slave_control: Impedance, gains: StructureGains | None = None, *, delay_forward: float = 0.0,
     delay_back: float = 0.0, jerk: bool = False,
 ) -> TwoPort:  # fmt: skip
-    """Build the two-port of a teleoperator with a known structure.
+    """Build the linear two-port of a teleoperator with a named control structure.
 
     Args:
         structure: `position_position` (coordinating force), `position_force` (direct force),
@@ -165,14 +168,16 @@ def make_two_port(
 
 
 def hybrid_matrix(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
-    """Return the hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
+    """Return the hybrid matrix H of a two-port, `[F_h, -V_e] = H [V_h, F_e]`.
+
+    F_h and V_h are force and velocity of the hand, F_e and V_e those of the environment.
 
     Args:
         port: the two-port.
         s: (...) complex frequencies [rad/s].
 
     Returns:
-        (..., 2, 2).
+        (..., 2, 2) complex matrices.
 
     Source: Zhu 1994, 3.10-3.11.
     """
@@ -184,7 +189,7 @@ def hybrid_matrix(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
 
 def transmitted_impedance(port: TwoPort, s: np.ndarray | complex, environment: Block) -> np.ndarray:
-    """Return the impedance that is transmitted to the operator.
+    """Return the impedance that the operator feels at the master, with the slave on a task.
 
     Args:
         port: the two-port.
@@ -192,7 +197,7 @@ def transmitted_impedance(port: TwoPort, s: np.ndarray | complex, environment: B
         environment: impedance of the task.
 
     Returns:
-        (...) [N s/m].
+        (...) complex hand force per hand velocity [N s/m].
 
     Source: Zhu 1994, 3.12.
     """
@@ -211,7 +216,7 @@ def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -
             depend on it.
 
     Returns:
-        (...).
+        (...) norms [1].
 
     Source: Anderson and Spong 1989; Zhu 1994, chapter 3.
     """
@@ -219,7 +224,11 @@ def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -
 
 
 def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
-    """Return `scattering_norm` of hybrid matrices (..., 2, 2)."""
+    """Return the largest singular value of the scattering matrix that belongs to a hybrid matrix.
+
+    `matrix` (..., 2, 2) are hybrid matrices and `unit` the reference impedance [N s/m]. The norms (...)
+    are at most 1 for a passive port.
+    """
     h = matrix * np.array([[1.0 / unit, 1.0], [1.0, unit]])
     one = np.eye(2)
     scatter = np.diag([1.0, -1.0]) @ (h - one) @ np.linalg.inv(h + one)
@@ -227,7 +236,7 @@ def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
 
 
 def characteristic_function(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block) -> np.ndarray:
-    """Return the characteristic function of hand, teleoperator and task, which is 0 at the poles.
+    """Return the characteristic function of hand, teleoperator and task: 0 at the closed loop's poles.
 
     Args:
         port: the two-port.
@@ -236,7 +245,8 @@ def characteristic_function(port: TwoPort, s: np.ndarray | complex, hand: Block,
         environment: impedance of the task.
 
     Returns:
-        (...) `(Z_m + C_m + Z_h)(Z_s + C_s + Z_e) + (C2 Z_e + C4)(C1 - C3 Z_h)` [(N s/m)^2].
+        (...) `(Z_m + C_m + Z_h)(Z_s + C_s + Z_e) + (C2 Z_e + C4)(C1 - C3 Z_h)` [(N s/m)^2], with
+        impedances Z of master m, slave s, hand h and environment e.
 
     Source: Zhu 1994, 3.13.
     """
@@ -251,16 +261,16 @@ def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
     """Return the margin of the stability theorem of stiffness feedback, `B^2 - 4 M K_max`.
 
     `M x'' + B x' + K(t) x = 0` with a stiffness between `K_min > 0` and K_max is uniformly
-    asymptotically stable if the margin and B are positive, for any rate of change of the stiffness,
-    and for any delay or task that causes it. The theorem does not cover `K_min = 0`.
+    asymptotically stable if the margin and B are positive. This holds for any rate of change of the
+    stiffness, and for any delay or task that causes it. The theorem does not cover `K_min = 0`.
 
     Args:
         mass: mass of joystick and hand, M [kg] or [kg m^2].
         damping: damping of both, B [N s/m] or [N m s/rad].
-        stiffest: K_max [N/m] or [N m/rad].
+        stiffest: upper bound of the stiffness, K_max [N/m] or [N m/rad].
 
     Returns:
-        The margin.
+        The margin [(N s/m)^2] or [(N m s/rad)^2].
 
     Source: Zhu 1994, theorem 4-2, 4.11-4.14.
 
@@ -283,14 +293,14 @@ _WHERE_STABILITY = "stability"
 
 
 class PoleOnAxisError(InputError):
-    """A pole lies on the imaginary axis, so that encirclements cannot be counted."""
+    """Error: a pole lies on the imaginary axis, so that unstable poles cannot be counted."""
 
 
 def count_unstable_poles(
     port: TwoPort, hand: Block, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4,
     masses: int = 2,
 ) -> int:  # fmt: skip
-    """Return the number of poles in the right half-plane.
+    """Return the number of poles of hand, teleoperator and task in the right half-plane.
 
     The characteristic function has poles only at 0, so that the winding of its phase along the
     imaginary axis counts its zeros. Poles at 0, such as the drift of a free slave, do not count.
@@ -317,19 +327,19 @@ def count_unstable_poles(
 
 
 def count_unstable_poles_held(port: TwoPort, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4) -> int:
-    """Return the number of unstable poles while the master's motion is imposed.
+    """Return the number of unstable poles of slave and task while the master's motion is imposed.
 
     Args:
         port: the two-port.
         environment: impedance of the task.
-        lowest: see `count_unstable_poles`.
-        highest: see `count_unstable_poles`.
+        lowest: frequency below which no poles are expected [rad/s].
+        highest: frequency above which the masses dominate [rad/s].
 
     Returns:
         The number of zeros of `Z_s + C_s + Z_e - C3 (C2 Z_e + C4)` in the right half-plane.
 
     Raises:
-        InputError: see `count_unstable_poles`.
+        InputError: the slave has no mass, or the phase is not resolved.
     """
 
     def loop_function(s: np.ndarray) -> np.ndarray:
@@ -341,12 +351,20 @@ def count_unstable_poles_held(port: TwoPort, environment: Block, *, lowest: floa
 
 
 def is_stable(port: TwoPort, hand: Block, environment: Block) -> bool:
-    """Return whether no pole lies in the right half-plane; see `count_unstable_poles`."""
+    """Return whether hand, teleoperator and task have no pole in the right half-plane.
+
+    Raises:
+        InputError: a side has no mass, or a pole lies on the imaginary axis.
+    """
     return count_unstable_poles(port, hand, environment) == 0
 
 
 def _count_unstable_zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
-    """Count the zeros in the right half-plane of a function that has poles only at 0."""
+    """Count the zeros in the right half-plane of a function that has poles only at 0.
+
+    The winding of the phase along the imaginary axis gives the number (argument principle); `lowest`
+    and `highest` limit the frequencies [rad/s].
+    """
     shift = _CONTOUR_OFFSET * lowest
     order = _growth_order(function, highest, least_order)
 
@@ -374,7 +392,10 @@ def _count_unstable_zeros(function: Block, lowest: float, highest: float, least_
 
 
 def _growth_order(function: Block, highest: float, least: int) -> int:
-    """Return the power of s with which the function grows; delays vanish far to the right."""
+    """Return the power of s with which a function grows for large real s, where delays vanish.
+
+    Raise InputError if it is below `least`.
+    """
     far = highest * np.array([1e2, 1e3], complex)
     sizes = np.abs(function(far))
     order = round(float(np.log10(sizes[1] / sizes[0])))

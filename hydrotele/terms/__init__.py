@@ -1,5 +1,6 @@
-"""Terms: additional laws that act on a drive's force, flows or command in every simulator.
+"""Terms: additional force, flow or command laws of a drive that every simulator applies.
 
-A `Term` of a machine specifies a law of `LAWS` and its parameters. Laws are small functions of the
-state of a drive. They are compiled, and both the reduced model and MuJoCo call them natively.
+A law is a small function of a drive's state, such as a drag force as a function of velocity. A
+`Term` of a machine names a law, its parameters, and the drive and balance to which it adds. Laws are
+compiled; the reduced model and the MuJoCo model both call the compiled code.
 """

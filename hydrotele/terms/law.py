@@ -12,7 +12,8 @@ and other compiled functions only. A parameter is a number by default. An argume
 annotated as `Numbers` is a list in the file and an array in the call. Default values of arguments
 apply to omitted parameters.
 
-A `Term` of a machine specifies which law adds to which balance of which drive.
+A `Term` of a machine specifies which law adds to which balance of which drive. A balance is one of
+the sums in `BALANCES`: force, chamber flows, command or supply flow.
 
 The law `formula` evaluates sums of products of basic functions, given in machine files:
 
@@ -113,11 +114,14 @@ def _suggest_variable(name: str) -> str:
 
 
 class Variable(int):
-    """Annotation of a law's argument: index of a state variable, given by its name in files."""
+    """Annotation of a law's argument that selects a state variable.
+
+    Machine files give the variable's name; the compiled law receives its index in `DriveState`.
+    """
 
 
 class Numbers(np.ndarray):
-    """Annotation of a law's argument: a list of numbers; nested lists are flattened."""
+    """Annotation of a law's argument that is a list of numbers, passed as a flat array."""
 
 
 Value = float | str | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -127,7 +131,7 @@ _KINDS = (float, Variable, Numbers)
 
 @dataclass(frozen=True)
 class Law:
-    """A law that terms can use.
+    """A registered law: its function, and how to check and encode its parameters.
 
     Attributes:
         name: name of the law in machine files.
@@ -155,8 +159,9 @@ class Law:
             parameters: parameters as in a machine file.
 
         Returns:
-            (n,) array: n, then one number per float or Variable and the index range per Numbers,
-            then the contents of all Numbers.
+            (n,) array. Its first element is n. The arguments follow in order: the value of a float,
+            the index of a Variable, or the start and stop index of a list in this array. The
+            contents of all lists follow at the end.
 
         Raises:
             ValueError: a parameter is missing, unknown or of the wrong kind; lists the valid ones.
@@ -183,7 +188,11 @@ class Law:
 
 
 def _encode_value(law: str, name: str, kind: type, value: Any) -> list[float]:
-    """Convert one parameter to a list of numbers; raise ValueError for an invalid value."""
+    """Convert one parameter of a law to a list of numbers.
+
+    `kind` is float, Variable or Numbers. Raise ValueError, with the name of law and parameter, for an
+    invalid value.
+    """
     where = f"law {law}: parameter {name}"
     if kind is Variable:
         if value not in VARIABLES:
@@ -213,9 +222,9 @@ def law(
     """Register a function as a law under its name; decorator.
 
     Args:
-        function: `(state, *parameters) -> float`; see the module docstring.
-        check: see `Law`.
-        translate: see `Law`.
+        function: `(state, *parameters) -> float`, with annotations as in the module docstring.
+        check: function that raises ValueError for invalid parameters.
+        translate: function that converts the parameters of a machine file to the arguments.
 
     Returns:
         The unchanged function, which can also be called from Python with a `DriveState`.
@@ -241,7 +250,10 @@ def law(
 
 
 class LawSource:  # noqa: N801 - a context manager, named as it is read
-    """Context manager that records the file or plug-in that defines laws."""
+    """Context manager: laws that are registered inside it belong to a given file or plug-in.
+
+    Error messages and `Law.source` name that file or plug-in.
+    """
 
     def __init__(self, source: str) -> None:
         """Store the name of the file or plug-in."""
@@ -279,8 +291,10 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
         parameters: product -> coefficient.
 
     Returns:
-        `numbers`: number of products; for each product its coefficient and number of factors; for
-        each factor function, variable, variable to subtract or -1, two constants, power.
+        Dictionary with the key `numbers`, a flat list. It starts with the number of products. Each
+        product follows as its coefficient, its number of factors, and six numbers per factor:
+        function code (0 for none), variable index, index of the variable to subtract (-1 for none),
+        two constants, power.
 
     Raises:
         ValueError: a product cannot be parsed; the message describes the syntax.
@@ -302,7 +316,10 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
 
 
 def _parse_product(text: str) -> list[list[float]]:
-    """Parse a product into its encoded factors; the product `1` has none."""
+    """Parse a product such as `velocity * abs(velocity)` into six numbers per factor.
+
+    The product `1` has no factors. Raise ValueError for invalid syntax.
+    """
     text = text.strip()
     if len(text) > _MAX_PRODUCT_LENGTH:
         raise _formula_error(text, f"it has {len(text)} characters, at most {_MAX_PRODUCT_LENGTH}")
@@ -318,7 +335,7 @@ def _parse_product(text: str) -> list[list[float]]:
 
 
 def _split_factors(node: ast.expr) -> list[ast.expr]:
-    """Return the factors of a product as syntax nodes."""
+    """Split the syntax tree of a product `a * b * c` into the syntax nodes of its factors."""
     factors, waiting = [], [node]
     while waiting:
         part = waiting.pop()
@@ -330,7 +347,7 @@ def _split_factors(node: ast.expr) -> list[ast.expr]:
 
 
 def _parse_factor(text: str, node: ast.expr) -> list[float]:
-    """Encode a factor: function, variables, constants and power."""
+    """Encode a factor as function code, two variable indices, two constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         exponent = _number_of(node.right)
@@ -353,14 +370,14 @@ def _parse_factor(text: str, node: ast.expr) -> list[float]:
 
 
 def _parse_argument(text: str, node: ast.expr) -> list[int]:
-    """Return the indices of a variable and of the variable to subtract, -1 for none."""
+    """Return the indices of the variables of `a` or `a - b`; the second is -1 without `b`."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return [_parse_variable(text, node.left), _parse_variable(text, node.right)]
     return [_parse_variable(text, node), _NO_VARIABLE]
 
 
 def _parse_variable(text: str, node: ast.expr) -> int:
-    """Return the index of a variable."""
+    """Return the index in `DriveState` of the variable that a syntax node names."""
     name = node.id if isinstance(node, ast.Name) else ast.get_source_segment(text, node) or text
     if name not in VARIABLES:
         raise _formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
@@ -368,7 +385,7 @@ def _parse_variable(text: str, node: ast.expr) -> int:
 
 
 def _parse_number(text: str, node: ast.expr) -> float:
-    """Return the value of a numeric constant."""
+    """Return the value of a numeric constant; raise ValueError for another or too large value."""
     value = _number_of(node)
     if not abs(value) <= MAX_MAGNITUDE:
         segment = ast.get_source_segment(text, node) or text
@@ -377,7 +394,7 @@ def _parse_number(text: str, node: ast.expr) -> float:
 
 
 def _number_of(node: ast.expr) -> float:
-    """Return the number that a syntax node states, with or without a sign; NaN for other nodes."""
+    """Return the value of a syntax node that is a number, with or without a sign; otherwise NaN."""
     sign = 1
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
         sign, node = -1 if isinstance(node.op, ast.USub) else 1, node.operand
@@ -387,7 +404,7 @@ def _number_of(node: ast.expr) -> float:
 
 
 def _formula_error(text: str, why: str) -> ValueError:
-    """Create the error for a formula that cannot be parsed."""
+    """Create (not raise) the error for a formula that cannot be parsed, with the reason `why`."""
     return ValueError(
         f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
         f" variables and of {', '.join(FUNCTIONS)}"
@@ -396,13 +413,13 @@ def _formula_error(text: str, why: str) -> ValueError:
 
 @law
 def constant(s: DriveState, value: float) -> float:
-    """Return a constant value."""
+    """Return a constant contribution to the balance, `value` in the unit of the balance."""
     return value
 
 
 @law
 def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
-    """Return a pulse of height `size` from `start` [s] for a `duration` [s].
+    """Return a pulse over time: `size` from `start` [s] for a `duration` [s], otherwise 0.
 
     The edges are half cosine waves, centred on start and end; their length is the fraction `edge`
     of the duration. The pulse is thus differentiable with respect to every parameter.
@@ -424,18 +441,18 @@ def pulse(s: DriveState, size: float, start: float, duration: float, edge: float
 
 @law
 def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
-    """Return a value that grows by `rate` per second from `start` [s] on."""
+    """Return a ramp over time: 0 until `start` [s], then growing by `rate` per second."""
     return rate * max(0.0, s.time - start)
 
 
 @law
 def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
-    """Return `value (1 - exp(-t / time_constant))`."""
+    """Return a drift from 0 to `value`, `value (1 - exp(-t / time_constant))`, with t the time [s]."""
     return value * (1.0 - math.exp(-s.time / time_constant))
 
 
 def _check_points(given: Parameters, *names: str) -> None:
-    """Raise ValueError unless each list has at least two increasing numbers."""
+    """Raise ValueError unless each named parameter is a list of at least two increasing numbers."""
     for name in names:
         points = list(given[name])
         if len(points) < 2 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
@@ -461,7 +478,10 @@ def _check_bilinear_table(given: Parameters) -> None:
 
 @law(check=_check_table)
 def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers) -> float:
-    """Interpolate linearly in one variable; constant beyond the first and the last point.
+    """Interpolate a table linearly in one state variable.
+
+    `points` [unit of the variable] increase; `values` are the contributions to the balance at these
+    points. Beyond the first and the last point the value is constant.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(velocity=0.15)
@@ -489,9 +509,10 @@ def bilinear_table(
     s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
     column_points: Numbers, values: Numbers,
 ) -> float:  # fmt: skip
-    """Interpolate bilinearly in two variables; constant beyond the outer points.
+    """Interpolate a table bilinearly in two state variables; constant beyond the outer points.
 
-    `values` has one row for each of the `row_points`.
+    `values` has one row for each of the `row_points`, and one column for each of the
+    `column_points`; the compiled law receives it row by row.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=9.0)
@@ -518,7 +539,9 @@ def bilinear_table(
 
 @law(translate=formula_arguments)
 def formula(s: DriveState, numbers: Numbers) -> float:
-    """Return a sum of coefficients times products of basic functions, see `hydrotele.terms.law`.
+    """Evaluate a formula: a sum of products of basic functions, each with a coefficient.
+
+    `numbers` is the encoding of `formula_arguments`; the module docstring gives the syntax.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(velocity=-2.0)
@@ -562,13 +585,19 @@ def formula(s: DriveState, numbers: Numbers) -> float:
 
 @law
 def quadratic_drag(s: DriveState, coefficient: float) -> float:
-    """Return a drag force proportional to the square of the speed, `-c v |v|`."""
+    """Return a drag force proportional to the square of the speed, `-c v |v|` [N] or [N m].
+
+    c is `coefficient` [N s^2/m^2] or [N m s^2/rad^2], v the velocity of the drive.
+    """
     return -coefficient * s.velocity * abs(s.velocity)
 
 
 @law
 def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) -> float:
-    """Return dry friction proportional to the load, `-c |F| tanh(v / v0)`, of seals and guides.
+    """Return dry friction of seals and guides that is proportional to the drive's load.
+
+    The force is `-c |F| tanh(v / v0)`: c is `coefficient` [1], F the force of the oil [N] or [N m],
+    v the velocity, and v0 the `smoothing_velocity` [m/s] or [rad/s].
 
     Source: Armstrong-Helouvry, Dupont and Canudas de Wit 1994, Automatica 30(7), load dependence.
     """
@@ -577,18 +606,24 @@ def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) 
 
 @law
 def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float) -> float:
-    """Return dry friction at one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`."""
+    """Return dry friction around one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`.
+
+    F is `coulomb` [N] or [N m], x the position, c the `centre` and w the `width` of the friction
+    zone [m] or [rad], v the velocity and v0 the `smoothing_velocity` [m/s] or [rad/s].
+    """
     far = (s.position - centre) / width
     return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
 
 
 @law
 def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
-    """Return the turbulent leakage into the rod-side chamber, `k sgn(dp) sqrt(|dp|)` smoothed.
+    """Return the turbulent leakage from the head-side into the rod-side chamber [m^3/s].
 
-    With a negative `flow_gain` it is the flow into the head-side chamber.
+    The flow is `k dp / (dp^2 + d^2)^(1/4)`, that is `k sgn(dp) sqrt(|dp|)` smoothed below d. k is the
+    `flow_gain` [m^3/(s sqrt(Pa))], dp the head-side minus the rod-side pressure and d the
+    `smoothing` pressure [Pa]. With a negative `flow_gain` it is the flow into the head-side chamber.
 
-    Source: as `hydraulics.laws.orifice`.
+    Source: orifice equation, as `hydraulics.laws.orifice_flow`.
     """
     drop = s.pressure_head - s.pressure_rod
     return flow_gain * drop / math.sqrt(math.sqrt(drop * drop + smoothing * smoothing))
@@ -596,9 +631,11 @@ def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
 
 @law
 def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: float) -> float:
-    """Return the change of viscous friction b v with the oil's viscosity, `-b (m(t) - 1) v`.
+    """Return the change of viscous friction while the oil's viscosity drifts, `-b (m(t) - 1) v`.
 
-    The viscosity is m(t) times the initial one, `m = 1 + (r - 1)(1 - exp(-t / T))`.
+    b is the initial coefficient `viscous` [N s/m] or [N m s/rad], and v the velocity. The viscosity
+    is m(t) times the initial one, `m = 1 + (r - 1)(1 - exp(-t / T))`, with the final `ratio` r [1]
+    and the `time_constant` T [s].
     """
     change = (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
     return -viscous * change * s.velocity
@@ -606,9 +643,12 @@ def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: fl
 
 @law
 def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: float) -> float:
-    """Return the change of laminar leakage to the rod side, `k (1 / m(t) - 1) (p_A - p_B)`.
+    """Return the change of laminar leakage while the oil's viscosity drifts [m^3/s].
 
-    With a negative `leakage` it is the flow into the head-side chamber; m as in `viscous_drift`.
+    The flow into the rod-side chamber changes by `k (1 / m(t) - 1) (p_A - p_B)`, with the initial
+    `leakage` k [m^3/(s Pa)] and the head- and rod-side pressures p_A and p_B. m(t) is the viscosity
+    relative to the initial one, `1 + (ratio - 1)(1 - exp(-t / time_constant))`. With a negative
+    `leakage` it is the change of the flow into the head-side chamber.
     """
     viscosity = 1.0 + (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
     return leakage * (1.0 / viscosity - 1.0) * (s.pressure_head - s.pressure_rod)
@@ -624,11 +664,12 @@ DRIVE_VARIABLES = (
 
 
 class Play(StrictModel):
-    """Backlash operator of a term: its output follows the variable at most `half_width` behind.
+    """Backlash operator (play) between a state variable and the law of a term.
 
-    The law reads the output as `play_output` and the difference between variable and output as
-    `play_difference`.
-    The initial output is 0, or the nearest value that the variable allows.
+    The output stays constant while the variable moves within `half_width` [unit of the variable] of
+    it, and follows the variable beyond. The law reads the output as `play_output`, and the variable
+    minus the output as `play_difference`. The initial output is the value nearest to 0 that the
+    variable permits.
     """
 
     variable: str
@@ -636,11 +677,11 @@ class Play(StrictModel):
 
 
 class Switch(StrictModel):
-    """Relay with hysteresis that switches a law on and off.
+    """Relay with hysteresis that switches a law on and off by a state variable.
 
-    The law becomes active when the variable passes `on`, and inactive when it returns past `off`.
-    Each transition is a ramp over a tenth of the interval between both. With `on` below `off` the
-    law is active at low values of the variable.
+    The law becomes active when the variable passes `on`, and inactive when it returns past `off`
+    (both in the unit of the variable). Each transition is a ramp over a tenth of the interval between
+    both. With `on` below `off` the law is active at low values of the variable.
     """
 
     variable: str
@@ -655,8 +696,10 @@ class Switch(StrictModel):
 
 
 class Term(StrictModel):
-    """A law that adds to a balance of a drive.
+    """A law with parameters that adds a force, flow or command to one drive of a machine.
 
+    - `axis`: name of the drive's axis.
+    - `law`, `parameters`: name of the law, and the values of its arguments.
     - `name`: origin of the term, such as the name of an effect.
     - `balance`: `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
       [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (flow of the shared pump,

@@ -1,9 +1,10 @@
 """Encoding of terms as one array that every simulator reads, and their compiled evaluation.
 
-Compiled code finds laws in a table of function addresses of this process, which it refers to by a
-symbol. Models and exported files therefore contain no addresses, and compiled code can be cached on
-disk. The row of a term has the law's index in that table and a checksum of its name. If both do not
-match, as in a file from another process, the term adds nothing.
+A term is a law with parameters that adds to the force, flow or command of a drive. Compiled code
+finds the laws in a table of function addresses of this process, which it refers to by a symbol.
+Models and exported files therefore contain no addresses, and compiled code can be cached on disk.
+The row of a term has the law's index in that table and a checksum of its name. If index and checksum
+do not match, as in a file from another process, the term adds nothing.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false, reportArgumentType=false
 # numba's intrinsics are called without their typing context.
@@ -45,7 +46,7 @@ COUNT_INDEX = 1  # index of the number of terms, after the marker
     _SHIFT,
     _SCALE,
     _ROW_SIZE,
-) = range(16)  # columns of a term's row; _ROW is their number
+) = range(16)  # columns of a term's row; _ROW_SIZE is their number
 PLAY, SWITCH = 1, 2  # kinds of hysteresis of a term, 0 for none
 _SWITCH_RAMP_FRACTION = 0.1  # width of a switch's ramps, as a fraction of the interval between its thresholds
 _HEADER_SIZE = 2
@@ -64,7 +65,7 @@ binding.add_symbol("hydrotele_laws", _law_addresses.ctypes.data)
 
 
 def law_index(name: str) -> int:
-    """Return the index of a law in the law table of this process; compile it on first use.
+    """Return the index of a law in this process's table of law addresses; compile it on first use.
 
     Raises:
         InputError: the law is not known in this process, or numba cannot compile it.
@@ -86,12 +87,16 @@ def law_index(name: str) -> int:
 
 
 def name_checksum(name: str) -> int:
-    """Return a checksum of a law's name that a float represents exactly."""
+    """Return the CRC-32 checksum of a law's name, an integer that a float represents exactly."""
     return zlib.crc32(name.encode())
 
 
 def _compile_c_function(law: Law):
-    """Compile a law to a C function `double(double *parameters, double *state)`."""
+    """Compile a law to a C function `double(double *parameters, double *state)`.
+
+    The parameters are those of `Law.encode_parameters`. Raise InputError if numba cannot compile a
+    user's law.
+    """
     places, arguments = 1, []
     for kind in law.kinds.values():
         if kind is Numbers:
@@ -129,14 +134,14 @@ def terms_table(
     terms: Sequence[Term], order: Sequence[str], memory: int = 0,
     areas: Mapping[str, Sequence[float]] | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Encode terms as an array for compiled code.
+    """Encode a machine's terms as one array, which the compiled functions of this module read.
 
     Args:
         terms: terms of a machine.
         order: axis names in actuator order.
-        memory: activation index of the internal state of the first term with hysteresis; those of
-            further terms follow. 0 if there are no such activations: the internal states are
-            then 0.
+        memory: index, in MuJoCo's activation vector, of the internal state of the first term with
+            hysteresis; those of further terms follow. 0 if there are no such activations: all
+            internal states then count as 0.
         areas: hydraulic axis -> (2,) areas on which its head- and rod-side pressures act [m^2] or
             [m^3/rad], for terms that use the force of another drive.
 
@@ -170,12 +175,15 @@ def terms_table(
 
 
 def terms_with_hysteresis(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms with hysteresis, in their order."""
+    """Return the terms with hysteresis (backlash operator or relay), in their order."""
     return [term for term in terms if term.play or term.switch]
 
 
 def _hysteresis_parameters(term: Term, place: int) -> tuple[float, ...]:
-    """Return kind, activation index, variable, shift and scale of a term's hysteresis."""
+    """Return kind, activation index, variable index, shift and scale of a term's hysteresis.
+
+    The hysteresis operates on `(variable - shift) / scale`. The kind is 0 without hysteresis.
+    """
     if term.play:
         return PLAY, place, VARIABLES[term.play.variable], 0.0, term.play.half_width
     if term.switch:
@@ -186,7 +194,7 @@ def _hysteresis_parameters(term: Term, place: int) -> tuple[float, ...]:
 
 @intrinsic
 def _law_table_address(typingctx):
-    """Return the address of the law table of this process."""
+    """Return the address of this process's table of law functions (numba intrinsic)."""
 
     def codegen(context, builder, signature, args):
         integer, name = ir.IntType(64), "hydrotele_laws"
@@ -198,7 +206,7 @@ def _law_table_address(typingctx):
 
 @intrinsic
 def _read_int64(typingctx, address):
-    """Return the int64 at an address."""
+    """Return the int64 at a memory address (numba intrinsic)."""
 
     def codegen(context, builder, signature, args):
         place = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
@@ -209,7 +217,11 @@ def _read_int64(typingctx, address):
 
 @intrinsic
 def _call_law(typingctx, function, terms, at, state):
-    """Call the law at an address with the parameters at an index of the table; return its value."""
+    """Call a compiled law and return its value (numba intrinsic).
+
+    `function` is the address of the law, `at` the index of its parameters in the table `terms`, and
+    `state` the DriveState.
+    """
 
     def codegen(context, builder, signature, args):
         function, terms, at, state = args
@@ -227,7 +239,11 @@ def _call_law(typingctx, function, terms, at, state):
 
 @allocation_free
 def _law_variable(terms, at, k, value, s, drives):
-    """Return a variable as the law of a term gets it: of the drive in `of`, clipped to `domain`."""
+    """Return the value of state variable k that the law of a term receives.
+
+    It is that of another drive if the term's `variables_from` names one, otherwise `value`. It is
+    clipped to the term's `domain`. `at` is the start of the term's row in the table.
+    """
     first = int(terms[at + _DOMAIN])
     last = first + 3 * int(terms[at + _RANGES])
     for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
@@ -241,14 +257,14 @@ def _law_variable(terms, at, k, value, s, drives):
 
 @allocation_free
 def _hysteresis_state(terms, at, drives):
-    """Return the internal state of a term, scalar [1]; 0 if it has no activation."""
+    """Return the internal state of a term's hysteresis, scalar [1]; 0 if no activation holds it."""
     place = int(terms[at + _STATE_INDEX])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
 
 @allocation_free
 def _hysteresis_variable(terms, at, s, drives):
-    """Return the current value of the variable of a term's hysteresis [its unit]."""
+    """Return the present value of the state variable that drives a term's hysteresis [its unit]."""
     k = int(terms[at + _HYSTERESIS_VARIABLE])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
     for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
@@ -259,17 +275,17 @@ def _hysteresis_variable(terms, at, s, drives):
 
 @allocation_free
 def update_hysteresis(kind, state, x):
-    """Update the internal state of a play or switch for a new value of its variable.
+    """Update a backlash operator or a relay with hysteresis for a new value of its variable.
 
     Args:
-        kind: PLAY or SWITCH.
+        kind: PLAY (backlash operator) or SWITCH (relay).
         state: previous internal state, scalar [1].
         x: for a play the variable divided by the half width; for a switch the variable scaled to
             0 at the off threshold and 1 at the on threshold, scalar [1].
 
     Returns:
-        New internal state, scalar [1]: the output of the play divided by the half width, or the
-        factor on the law.
+        New internal state, scalar [1]: the output of the backlash operator divided by its half
+        width, or the factor 0 to 1 with which the relay multiplies the law.
 
     Source: play and relay with hysteresis, Visintin 1994, Differential Models of Hysteresis; the
         relay's jumps are ramps.
@@ -283,18 +299,19 @@ def update_hysteresis(kind, state, x):
 
 @allocation_free
 def update_term_state(terms, term, value, state):
-    """Update the internal state of a term for a new value of its variable.
+    """Update the hysteresis state of a term for a new value of its variable.
 
     Args:
         terms: (n,) table of `terms_table`.
-        term: index of a term with hysteresis.
-        value: value of its variable, scalar [its unit].
+        term: number of a term with hysteresis among all terms of the table.
+        value: present value of the variable of its hysteresis, scalar [its unit].
         state: previous internal state, scalar [1].
 
     Returns:
-        New internal state, scalar [1].
+        New internal state, scalar [1]: the scaled output of a backlash operator, or the factor of a
+        relay on its law.
 
-    Source: `update_hysteresis`.
+    Source: `update_hysteresis`, with the variable scaled by the term's width or thresholds.
     """
     at = _HEADER_SIZE + _ROW_SIZE * term
     x = (value - terms[at + _SHIFT]) / terms[at + _SCALE]
@@ -303,7 +320,12 @@ def update_term_state(terms, term, value, state):
 
 @allocation_free
 def hysteresis_location(terms, term):
-    """Return (activation index, axis, variable) of a term's hysteresis; index 0 for none."""
+    """Return where a term's hysteresis state is stored, and which drive's variable drives it.
+
+    Returns:
+        (index in MuJoCo's activation vector, 0 for none; actuator index of the drive; index of the
+        variable in `DriveState`).
+    """
     at = _HEADER_SIZE + _ROW_SIZE * term
     axis, k = int(terms[at + _AXIS]), int(terms[at + _HYSTERESIS_VARIABLE])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
@@ -315,7 +337,11 @@ def hysteresis_location(terms, term):
 
 @allocation_free
 def _other_drive_variable(terms, j, s, drives):
-    """Return the variable of another drive given by entry j; shared variables are those of s."""
+    """Return the variable of another drive that entry j of the table selects.
+
+    Time, supply pressure and other shared variables are those of s. The value is 0 if the simulator
+    does not provide the variable.
+    """
     k, i = int(terms[j]), int(terms[j + 1])
     if i < 0 or i >= len(drives.velocity):
         return 0.0
@@ -335,7 +361,11 @@ def _other_drive_variable(terms, j, s, drives):
 
 
 def window_factor(time, begin, end):
-    """Return the factor of a term's time window, 0 to 1, at a time or an array of times [s]."""
+    """Return the factor 0 to 1 by which a term's time window multiplies its law.
+
+    The factor is 1 between `begin` and `end` and 0 outside, with linear ramps of 0.1 s centred on
+    both. `time` is a scalar or an array [s].
+    """
     return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _WINDOW_RAMP))
 
 
@@ -344,15 +374,15 @@ _window_factor = allocation_free(window_factor)
 
 @allocation_free
 def has_term(terms, balance, axis):
-    """Return whether any term adds to a balance of a drive, so that its inputs are needed.
+    """Return whether any term adds to a balance of a drive; otherwise its sum need not be computed.
 
     Args:
         terms: (n,) table of `terms_table`.
         balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
-        axis: index of the actuator, or ANY.
+        axis: index of the actuator, or ANY_DRIVE.
 
     Returns:
-        bool.
+        True if at least one term does.
     """
     if len(terms) == 0:
         return False
@@ -365,17 +395,17 @@ def has_term(terms, balance, axis):
 
 @allocation_free
 def sum_terms(terms, balance, axis, s, drives):
-    """Return the sum of all terms of a balance of a drive.
+    """Return the sum of the laws of all terms that add to a balance of a drive.
 
     Args:
         terms: (n,) table of `terms_table`.
         balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator.
-        s: DriveState.
-        drives: Drives, for variables of other drives.
+        s: DriveState of the drive.
+        drives: Drives, for variables of other drives and hysteresis states.
 
     Returns:
-        Sum, scalar [N], [N m], [m^3/s], [1] or [V].
+        Sum, scalar [N], [N m], [m^3/s], [1] or [V]. Laws that this process does not know add 0.
     """
     total = 0.0
     if len(terms) == 0:
@@ -423,7 +453,10 @@ def sum_terms(terms, balance, axis, s, drives):
 
 @allocation_free
 def _shift_state(s, velocity, head, rod):
-    """Return the state with increments added to velocity and chamber pressures."""
+    """Return a copy of a DriveState with increments added to velocity and chamber pressures.
+
+    The derivatives by finite differences use it.
+    """
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
         s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.play_output,
@@ -433,17 +466,17 @@ def _shift_state(s, velocity, head, rod):
 
 @allocation_free
 def sum_terms_with_slope(terms, balance, axis, s, drives):
-    """Return the sum of the force or command terms, and its derivative by the velocity.
+    """Return the sum of the force or command terms of a drive, and its derivative by the velocity.
 
     Args:
         terms: (n,) table of `terms_table`.
         balance: FORCE or COMMAND.
         axis: index of the actuator.
-        s: DriveState.
-        drives: Drives.
+        s: DriveState of the drive.
+        drives: Drives, for variables of other drives.
 
     Returns:
-        (sum, d sum / d velocity), by a forward difference.
+        (sum [unit of the balance], d sum / d velocity), the second by a forward difference.
     """
     value = sum_terms(terms, balance, axis, s, drives)
     step = _VELOCITY_STEP * (1.0 + abs(s.velocity))
@@ -453,7 +486,7 @@ def sum_terms_with_slope(terms, balance, axis, s, drives):
 
 @allocation_free
 def sum_flow_terms(terms, axis, s, drives):
-    """Return the flows that terms add to both chambers of an axis, and their slopes.
+    """Return the flows that terms add to both chambers of a drive, and their pressure derivatives.
 
     Args:
         terms: (n,) table of `terms_table`.
