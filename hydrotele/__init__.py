@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 _CONFIGURATION = {"numba": ".numba_config.yaml", "matplotlib": "matplotlibrc"}
 
 
-def _ignore_configuration() -> None:
+def _ignore_local_configuration_files() -> None:
     """Prevent numba and matplotlib from reading a configuration file in the working folder.
 
     The working folder holds data, which must not be able to run code. A numba file can name a
@@ -29,7 +29,7 @@ def _ignore_configuration() -> None:
                 vars(import_module("numba.core.config"))["_config_fname"] = os.devnull
 
 
-_ignore_configuration()
+_ignore_local_configuration_files()
 
 
 _PUBLIC = {

@@ -49,7 +49,7 @@ def test_pressures_spools_and_tip_are_those_that_the_log_has():
     data.ctrl[:] = [0.1, 0.5, -0.4, 0.3]
     mujoco.mj_step(plant.model, data, nstep=200)
     assert np.array_equal(np.sign(plant.spools(data)), np.sign(data.ctrl))
-    areas = np.array([plant.machine.axes[a].hydraulic_drive.areas for a in plant.axes])
+    areas = np.array([plant.machine.axes[a].hydraulic_drive.effective_areas for a in plant.axes])
     force = areas[:, 0] * plant.pressures(data)[:, 0] - areas[:, 1] * plant.pressures(data)[:, 1]
     friction = np.array([plant.machine.axes[a].drive.friction.coulomb for a in plant.axes])
     mujoco.mj_forward(plant.model, data)

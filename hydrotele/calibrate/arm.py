@@ -22,8 +22,8 @@ from hydrotele.calibrate.estimation import classify_scaled_parameters, least_squ
 from hydrotele.calibrate.loop import (
     PARAMETER_KINDS,
     CalibrationLoop,
-    ball_position,
-    ball_position_and_rates,
+    ball_position_and_derivatives,
+    ball_position_from_axis,
     link_chain,
     unit_of,
 )
@@ -167,7 +167,7 @@ def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
     return first + own
 
 
-def expected_error(loop: CalibrationLoop, name: str) -> float:
+def expected_parameter_error(loop: CalibrationLoop, name: str) -> float:
     """Return the expected error of a parameter's nominal value before calibration [rad] or [m].
 
     It is larger for parameters measured on the machine than for those of the calibrator's links,
@@ -223,7 +223,7 @@ class StageEquations:
     def residual(self, parameters: Mapping[str, float]) -> np.ndarray:
         """Return the errors of both equations (M, 2) [m]: ball distance minus p_xy, height minus p_z."""
         loop, theta = self.chain_and_angles(parameters)
-        return self._error(ball_position(loop, self.place, theta), parameters)
+        return self._error(ball_position_from_axis(loop, self.place, theta), parameters)
 
     def residual_and_jacobian(self, parameters: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the errors of both equations at every pose, and their derivatives.
@@ -233,24 +233,26 @@ class StageEquations:
             derivatives by the S calibrator readings (M, 2, S) [m/rad]).
         """
         loop, theta = self.chain_and_angles(parameters)
-        s, by = ball_position_and_rates(loop, self.place, theta)
+        s, by = ball_position_and_derivatives(loop, self.place, theta)
         way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
         plane = way[:, 0, None, None] * by[:, 0] + way[:, 1, None, None] * by[:, 1]
         rows = np.stack([plane, by[:, 2]], axis=1)
         return self._error(s, parameters), rows, rows[:, :, loop.powered_count - self.place :, 0]
 
-    def select_columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
+    def select_parameter_derivatives(
+        self, derivatives: np.ndarray, names: Sequence[str], own_d: bool = False
+    ) -> np.ndarray:
         """Select the derivatives of the residuals by p named parameters.
 
         Args:
-            by: (M, 2, links, 5) derivatives by all link parameters, from `residual_and_jacobian`.
+            derivatives: (M, 2, links, 5) derivatives by all link parameters, from `residual_and_jacobian`.
             names: names of the parameters.
             own_d: whether to include the moving link's own d; otherwise its column is zero.
 
         Returns:
             (M, 2, p) derivatives; zero for parameters without effect.
         """
-        out = np.zeros((*by.shape[:2], len(names)))
+        out = np.zeros((*derivatives.shape[:2], len(names)))
         for column, name in enumerate(names):
             kind, _, link = name.partition(".")
             if kind in ("p_xy", "p_z"):
@@ -262,9 +264,9 @@ class StageEquations:
                 if k == 0 and kind == "d" and not own_d:
                     continue
                 if kind == "held" and held:
-                    out[:, :, column] = by[:, :, k, 0]
+                    out[:, :, column] = derivatives[:, :, k, 0]
                 elif kind != "held" and not (kind == "offset" and self.place + k < self.loop.powered_count):
-                    out[:, :, column] = by[:, :, k, PARAMETER_KINDS.index(kind)]
+                    out[:, :, column] = derivatives[:, :, k, PARAMETER_KINDS.index(kind)]
         return out
 
     def whitening_factors(self, by_readings: np.ndarray) -> np.ndarray:
@@ -354,13 +356,13 @@ def classify_candidates(
     """
     loop = equations.loop
     _, by, sensed = equations.residual_and_jacobian(parameters)
-    matrix = equations.whitening_factors(sensed) @ equations.select_columns(by, names, own_d=True)
-    sizes = [expected_error(loop, name) for name in names]
+    matrix = equations.whitening_factors(sensed) @ equations.select_parameter_derivatives(by, names, own_d=True)
+    sizes = [expected_parameter_error(loop, name) for name in names]
     return classify_scaled_parameters(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
 
 
 def identify_stage(
-    equations: StageEquations, parameters: ParameterValues, own: list[str], earlier: tuple[str, ...],
+    equations: StageEquations, parameters: ParameterValues, own_names: list[str], earlier_names: tuple[str, ...],
     covariance: np.ndarray, identifiability: Identifiability, candidates: Sequence[str], weighted: bool = True,
     start_is_close: bool = False,
 ) -> tuple[StageFit, ParameterValues, np.ndarray]:  # fmt: skip
@@ -369,8 +371,8 @@ def identify_stage(
     Args:
         equations: equations of the stage.
         parameters: all parameters, the start of the search.
-        own: p parameters to identify.
-        earlier: q parameters identified by earlier stages.
+        own_names: p parameters to identify.
+        earlier_names: q parameters identified by earlier stages.
         covariance: (q, q) covariance of the earlier parameters.
         identifiability: identifiability of the candidate parameters.
         candidates: the candidate parameters.
@@ -385,51 +387,55 @@ def identify_stage(
         InputError: there are too few poses.
     """
     poses, loop = equations.poses, equations.loop
-    if 2 * len(poses) < _MIN_EQUATIONS_PER_PARAMETER * len(own):
+    if 2 * len(poses) < _MIN_EQUATIONS_PER_PARAMETER * len(own_names):
         raise InputError(
             poses.source,
-            f"{len(poses)} poses of {poses.link} are too few for {len(own)} parameters:"
-            f" record {len(own) * _MIN_EQUATIONS_PER_PARAMETER} or more, preferably 200",
+            f"{len(poses)} poses of {poses.link} are too few for {len(own_names)} parameters:"
+            f" record {len(own_names) * _MIN_EQUATIONS_PER_PARAMETER} or more, preferably 200",
         )
-    sizes = [expected_error(loop, name) for name in own]
-    start = np.array([parameters[name] for name in own])
+    sizes = [expected_parameter_error(loop, name) for name in own_names]
+    start = np.array([parameters[name] for name in own_names])
     iterations, fit = 0, None
     for _ in range(_MAX_REWEIGHTINGS if weighted else 1):
-        now = parameters if fit is None else parameters | dict(zip(own, fit.values.tolist(), strict=True))
+        now = parameters if fit is None else parameters | dict(zip(own_names, fit.values.tolist(), strict=True))
         whitening = equations.whitening_factors(equations.residual_and_jacobian(now)[2])
         if not weighted:
             level = np.sqrt(np.mean(np.linalg.inv(whitening) ** 2) * 2.0)
             whitening = np.broadcast_to(np.eye(2) / level, whitening.shape)
 
         def residual(x, whitening=whitening):
-            error = equations.residual(parameters | dict(zip(own, x.tolist(), strict=True)))
+            error = equations.residual(parameters | dict(zip(own_names, x.tolist(), strict=True)))
             return (whitening @ error[..., None]).ravel()
 
         def jacobian(x, whitening=whitening):
-            _, by, _ = equations.residual_and_jacobian(parameters | dict(zip(own, x.tolist(), strict=True)))
-            return (whitening @ equations.select_columns(by, own)).reshape(-1, len(own))
+            _, by, _ = equations.residual_and_jacobian(parameters | dict(zip(own_names, x.tolist(), strict=True)))
+            return (whitening @ equations.select_parameter_derivatives(by, own_names)).reshape(-1, len(own_names))
 
         fit = least_squares(
-            residual, start if fit is None else fit.values, own, sizes, sigma=1.0, jac=jacobian,
+            residual, start if fit is None else fit.values, own_names, sizes, sigma=1.0, jac=jacobian,
             truncation=TRUNCATION_LEVELS if iterations == 0 and not start_is_close else None, select="none",
         )  # fmt: skip
         iterations = iterations or fit.iterations
     assert fit is not None
-    parameters = parameters | dict(zip(own, fit.values.tolist(), strict=True))
+    parameters = parameters | dict(zip(own_names, fit.values.tolist(), strict=True))
     error, by, _ = equations.residual_and_jacobian(parameters)
-    inverse = np.linalg.pinv((whitening @ equations.select_columns(by, own)).reshape(-1, len(own)))
+    inverse = np.linalg.pinv(
+        (whitening @ equations.select_parameter_derivatives(by, own_names)).reshape(-1, len(own_names))
+    )
     chi = float(np.sqrt(np.mean(np.einsum("mij,mj->mi", whitening, error) ** 2)
-                        * 2 * len(poses) / (2 * len(poses) - len(own))))  # fmt: skip
-    before = (whitening @ equations.select_columns(by, earlier)).reshape(2 * len(poses), len(earlier))
+                        * 2 * len(poses) / (2 * len(poses) - len(own_names))))  # fmt: skip
+    before = (whitening @ equations.select_parameter_derivatives(by, earlier_names)).reshape(
+        2 * len(poses), len(earlier_names)
+    )
     through = -inverse @ before
     noise = max(chi, 1.0) ** 2 * inverse @ inverse.T
     corner = through @ covariance
     covariance = np.block([[covariance, corner.T], [corner, noise + corner @ through.T]])
-    columns = equations.select_columns(by, own).reshape(-1, len(own)) * sizes
+    columns = equations.select_parameter_derivatives(by, own_names).reshape(-1, len(own_names)) * sizes
     columns = columns / np.linalg.norm(columns, axis=0)
-    fixed = {name: _hold_reason(identifiability, name, loop) for name in candidates if name not in own}
+    fixed = {name: _hold_reason(identifiability, name, loop) for name in candidates if name not in own_names}
     stage = StageFit(
-        poses.link, tuple(own), identifiability, fixed, iterations, len(poses),
+        poses.link, tuple(own_names), identifiability, fixed, iterations, len(poses),
         float(np.sqrt(np.mean(error**2))), chi, float(np.linalg.cond(columns)),
     )  # fmt: skip
     return stage, parameters, covariance
@@ -438,7 +444,10 @@ def identify_stage(
 def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationLoop) -> str:
     """Return the reason why a candidate parameter keeps its nominal value, as a short text."""
     kind, _, link = name.partition(".")
-    if link in loop.links[loop.powered_count + 1 :] and expected_error(loop, name) == LABORATORY_ERRORS[unit_of(name)]:
+    if (
+        link in loop.links[loop.powered_count + 1 :]
+        and expected_parameter_error(loop, name) == LABORATORY_ERRORS[unit_of(name)]
+    ):
         if identifiability.status[identifiability.names.index(name)] != "unidentifiable":
             return "known more accurately from the laboratory"
     column = identifiability.combination[:, identifiability.names.index(name)]
@@ -487,7 +496,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     loop, names = fit.nominal, fit.names
     order = sort_stages(loop, stages)
     equations = [StageEquations(loop, poses) for poses in order]
-    sizes = np.array([expected_error(loop, name) for name in names])
+    sizes = np.array([expected_parameter_error(loop, name) for name in names])
     base = dict(fit.parameters)
     x = fit.values.copy()
     for _ in range(_MAX_REWEIGHTINGS):
@@ -505,7 +514,8 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
             return scipy.sparse.vstack([
                 scipy.sparse.csr_matrix(
-                    (w @ e.select_columns(e.residual_and_jacobian(at)[1], names)).reshape(-1, len(names)) * sizes
+                    (w @ e.select_parameter_derivatives(e.residual_and_jacobian(at)[1], names))
+                    .reshape(-1, len(names)) * sizes
                 ) for e, w in zip(equations, whitenings, strict=True)
             ]).tocsr()  # fmt: skip
 
@@ -570,7 +580,7 @@ def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str
     return np.einsum("mij,mj->mi", equations.whitening_factors(sensed), error)
 
 
-def machine_with_loop(machine: Machine, nominal: CalibrationLoop, loop: CalibrationLoop) -> Machine:
+def update_machine_geometry(machine: Machine, nominal: CalibrationLoop, loop: CalibrationLoop) -> Machine:
     """Return a machine whose link positions and joint axes are those of a calibrated chain.
 
     The joint zeros of the machine are kept; a changed offset in the chain is a sensor error.
@@ -664,7 +674,7 @@ def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -
         calibrator and manipulator sensors.
     """
     loop, nominal = fit.loop, fit.nominal
-    made = machine_with_loop(machine, nominal, loop)
+    made = update_machine_geometry(machine, nominal, loop)
     errors = dict(made.sensor_errors)
 
     def add_offset(channel: str, offset: float) -> None:

@@ -13,7 +13,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.logs.files import read_runs
 from hydrotele.logs.log import Log, missing_channels_message
 from hydrotele.logs.rows import merge_run
-from hydrotele.machine.machine import IDEAL_SENSORS, Machine, get_sensors, noise_rms
+from hydrotele.machine.machine import IDEAL_SENSORS, Machine, get_sensor_set, reading_noise_rms
 
 MAX_POSES = 300
 """Maximum number of poses taken from a log, evenly spaced; Khoshzaban's figures show 300 to 400."""
@@ -23,11 +23,11 @@ _TRANSDUCER_DEVIATION = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 
 _RESOLVER_DEVIATION = np.radians(0.1) / math.sqrt(3.0)  # default of a sensor without stated accuracy, K 2.5
 
 
-def read_stages(
+def read_calibration_poses(
     path: Path,
     machine: Machine,
     loop: CalibrationLoop,
-    poses: int = MAX_POSES,
+    max_poses: int = MAX_POSES,
     accuracy: float | None = None,
 ) -> list[Poses]:
     """Read the calibration logs of a folder, one per moving link, and convert them to poses.
@@ -36,7 +36,7 @@ def read_stages(
         path: folder of logs, run folder, or one log.
         machine: the machine with its calibrator.
         loop: the closed chain of this machine and its calibrator.
-        poses: maximum number of poses per log.
+        max_poses: maximum number of poses per log.
         accuracy: standard deviation of an angle reading [rad]; by default that of the sensors named
             in the log, or of Khoshzaban's resolvers.
 
@@ -46,7 +46,7 @@ def read_stages(
     Raises:
         InputError: a channel is missing, the machine differs, or the moving link is unknown.
     """
-    return [log_to_poses(log, machine, loop, poses, accuracy) for log in read_calibration_logs(path, machine)[0]]
+    return [log_to_poses(log, machine, loop, max_poses, accuracy) for log in read_calibration_logs(path, machine)[0]]
 
 
 def read_calibration_logs(path: Path, machine: Machine) -> tuple[tuple[Log, ...], tuple[str, ...]]:
@@ -79,7 +79,7 @@ def log_to_poses(
     log: Log,
     machine: Machine,
     loop: CalibrationLoop,
-    poses: int = MAX_POSES,
+    max_poses: int = MAX_POSES,
     accuracy: float | None = None,
 ) -> Poses:
     """Convert a log, in which one link moves, to calibrator poses.
@@ -88,7 +88,7 @@ def log_to_poses(
         log: log of one moving link.
         machine: the machine with its calibrator.
         loop: the closed chain of this machine.
-        poses: maximum number of poses.
+        max_poses: maximum number of poses.
         accuracy: standard deviation of an angle reading [rad]; None for that of the log's sensors, or
             of Khoshzaban's resolvers.
 
@@ -110,7 +110,7 @@ def log_to_poses(
     rows = np.flatnonzero(usable)
     if len(rows) < 2:
         raise InputError(f"{log.source}, column valid", "leaves no rows: mark valid rows with 1")
-    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(poses, len(rows))).round().astype(int))]
+    rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(max_poses, len(rows))).round().astype(int))]
     link = find_moving_link(log, loop)
     theta = np.stack([log[name][rows] for name in sensed], axis=1) * loop.signs[loop.powered_count :]
     own = {
@@ -118,12 +118,12 @@ def log_to_poses(
         for name, channel, sign in zip(loop.links, loop.channels, loop.signs, strict=True)
         if name in loop.links[: loop.powered_count] and channel in log
     }
-    sigma = np.array([_angle_deviation(log, machine, name, accuracy) for name in sensed])
-    others = [_angle_deviation(log, machine, f"angle.{name}", accuracy) for name in own]
+    sigma = np.array([_angle_noise_std(log, machine, name, accuracy) for name in sensed])
+    others = [_angle_noise_std(log, machine, f"angle.{name}", accuracy) for name in own]
     return Poses(link, theta, sigma, own, max(others, default=0.0), log.source, rows)
 
 
-def _angle_deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
+def _angle_noise_std(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
     """Return the noise of an angle channel's readings, a standard deviation [rad].
 
     It is `accuracy` if given, otherwise that of the log's sensors or of a resolver.
@@ -132,7 +132,7 @@ def _angle_deviation(log: Log, machine: Machine, channel: str, accuracy: float |
         return accuracy
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL_SENSORS:
-        known = noise_rms(machine, get_sensors(machine, name), channel)
+        known = reading_noise_rms(machine, get_sensor_set(machine, name), channel)
         return known or _RESOLVER_DEVIATION
     return _RESOLVER_DEVIATION
 
@@ -197,14 +197,14 @@ def split_poses(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], l
             [p.select(j) for p, j in zip(stages, judged, strict=True)])  # fmt: skip
 
 
-def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[AxisStrokes]:
+def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], max_samples: int = 0) -> list[AxisStrokes]:
     """Extract joint angles and cylinder displacements of the axes that move in a log.
 
     Args:
         log: log with channels `angle.AXIS` and `length.AXIS`.
         machine: the machine.
         axes: names of the axes to search.
-        poses: maximum number of samples; 0 for all.
+        max_samples: maximum number of samples; 0 for all.
 
     Returns:
         One item per axis that moves by at least 5 deg.
@@ -216,22 +216,22 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int 
         if not all(c in log for c in channels):
             continue
         rows = np.flatnonzero(valid & np.isfinite([log[c] for c in channels]).all(axis=0))
-        if poses and len(rows) > poses:
-            rows = rows[np.linspace(0, len(rows) - 1, poses).round().astype(int)]
+        if max_samples and len(rows) > max_samples:
+            rows = rows[np.linspace(0, len(rows) - 1, max_samples).round().astype(int)]
         if not len(rows) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
             continue
         angle, length = (log[c][rows] for c in channels)
-        sigma = _angle_deviation(log, machine, channels[0], None)
+        sigma = _angle_noise_std(log, machine, channels[0], None)
         found.append(AxisStrokes(
-            axis, angle, length, sigma, _length_deviation(log, machine, channels[1]), "measured",
+            axis, angle, length, sigma, _length_noise_std(log, machine, channels[1]), "measured",
             log.source,
         ))  # fmt: skip
     return found
 
 
-def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
+def _length_noise_std(log: Log, machine: Machine, channel: str) -> float:
     """Return the noise of a displacement channel's readings, a standard deviation [m]."""
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL_SENSORS:
-        return noise_rms(machine, get_sensors(machine, name), channel) or _TRANSDUCER_DEVIATION
+        return reading_noise_rms(machine, get_sensor_set(machine, name), channel) or _TRANSDUCER_DEVIATION
     return _TRANSDUCER_DEVIATION

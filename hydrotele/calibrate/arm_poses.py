@@ -71,7 +71,7 @@ class Poses:
 _TREND_DEGREE = 2  # polynomial degree over the poses: leakage decreases while pressures settle
 
 
-def add_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
+def add_held_link_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
     """Estimate how held links drift during a measurement, and add this drift to the poses.
 
     The drift is a polynomial of degree 2 through the readings of the manipulator's own sensors. Only

@@ -25,7 +25,7 @@ from hydrotele.calibrate.arm import (
     sort_stages,
 )
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position_and_rates
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position_and_derivatives
 
 FALSE_ALARM_PROBABILITY = 0.005
 """Probability of finding a region in a complete measurement without corruption."""
@@ -127,7 +127,7 @@ def whitened_residuals(
     covariance = spread @ spread.transpose(0, 2, 1) + _MIN_DEVIATION**2 * np.eye(2)
     if poses.link in poses.manipulator:
         seen, theta = equations.chain_and_angles(parameters)
-        s, by = ball_position_and_rates(seen, equations.place, theta)
+        s, by = ball_position_and_derivatives(seen, equations.place, theta)
         reach = np.hypot(s[:, 0], s[:, 1])
         around = np.stack([-s[:, 1], s[:, 0]], 1) / reach[:, None]
         by_sensed = by[:, :, loop.powered_count - equations.place :, 0]
@@ -148,7 +148,7 @@ def whitened_residuals(
     rows = (whitening @ error[..., None])[..., 0]
     if known and len(known.names):
         rows = _remove_parameter_errors(
-            rows, whitening @ equations.select_columns(slopes, known.names), known.covariance
+            rows, whitening @ equations.select_parameter_derivatives(slopes, known.names), known.covariance
         )
     return WhitenedResiduals(rows, whitening @ sensed, (whitening @ own[..., None])[..., 0])
 
@@ -181,7 +181,7 @@ def _remove_parameter_errors(rows: np.ndarray, slopes: np.ndarray, covariance: n
     return left
 
 
-def find_regions(
+def find_corrupted_regions(
     loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float], total: int,
     false_alarm: float = FALSE_ALARM_PROBABILITY,
     known: ParameterUncertainty | None = None,
@@ -217,7 +217,7 @@ def find_regions(
     threshold = np.log(total / false_alarm) / rate
     regions = []
     for first, last in _find_high_segments(score, threshold):
-        regions.append(_assign_joint(loop, poses, found, first, last))
+        regions.append(_attribute_region_to_joint(loop, poses, found, first, last))
     return regions
 
 
@@ -247,7 +247,7 @@ def _max_sum_segment(score: np.ndarray) -> tuple[float, int, int]:
     return best, first, last
 
 
-def _assign_joint(
+def _attribute_region_to_joint(
     loop: CalibrationLoop, poses: Poses, found: WhitenedResiduals, first: int, last: int
 ) -> CorruptedRegion:
     """Build the region of poses `first` to `last`, and find the joint whose sensor error explains it best."""
@@ -310,7 +310,7 @@ def identify_without_bad_data(
         told = classify_candidates(StageEquations(loop, poses), at, wanted)
         own = [told.names[k] for k in sorted(told.base)]
 
-        def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told,
+        def fit_kept_poses(kept, near, numbers=numbers, poses=poses, own=own, told=told,
                   wanted=wanted, names=names, covariance=covariance):  # fmt: skip
             return identify_stage(
                 StageEquations(loop, poses.select(kept)), numbers, own, names, covariance, told, wanted,
@@ -318,13 +318,17 @@ def identify_without_bad_data(
             )  # fmt: skip
 
         kept = np.ones(len(poses), bool)
-        found = solve(kept, False)
+        found = fit_kept_poses(kept, False)
         every = (*names, *own)
-        inside = find_regions(loop, poses, found[1], total, false_alarm, ParameterUncertainty(every, found[2]))
+        inside = find_corrupted_regions(
+            loop, poses, found[1], total, false_alarm, ParameterUncertainty(every, found[2])
+        )
         if inside:
-            found, inside = _iterate_regions(loop, poses, solve, found, total, false_alarm, every, own)
-        kept = _mask_regions(inside, len(poses))
-        found = solve(kept, True) if inside else found
+            found, inside = _refit_until_regions_stable(
+                loop, poses, fit_kept_poses, found, total, false_alarm, every, own
+            )
+        kept = _mask_uncorrupted_poses(inside, len(poses))
+        found = fit_kept_poses(kept, True) if inside else found
         stage, numbers, covariance = found
         names = (*names, *own)
         parts.append(stage)
@@ -334,7 +338,7 @@ def identify_without_bad_data(
     return CleanedFit(fit, kept_stages, regions)
 
 
-def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
+def _refit_until_regions_stable(loop, poses, solve, found, total, false_alarm, names, own):
     """Alternate between the fit and the search for corrupted regions until the regions stay the same.
 
     The first fits use only the poses with the smallest residuals.
@@ -351,8 +355,8 @@ def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
         found = solve(core, True)
     inside: list[CorruptedRegion] = []
     for _ in range(_MAX_ROUNDS):
-        fresh = find_regions(loop, poses, found[1], total, false_alarm, ParameterUncertainty(names, found[2]))
-        kept = _mask_regions(fresh, len(poses))
+        fresh = find_corrupted_regions(loop, poses, found[1], total, false_alarm, ParameterUncertainty(names, found[2]))
+        kept = _mask_uncorrupted_poses(fresh, len(poses))
         if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MAX_REMOVED_FRACTION:
             break
         inside = fresh
@@ -360,7 +364,7 @@ def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
     return found, inside
 
 
-def _mask_regions(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
+def _mask_uncorrupted_poses(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
     """Return a mask (count,) of the poses to keep: outside all regions that a calibrator joint corrupts."""
     kept = np.ones(count, bool)
     for region in regions:
@@ -369,7 +373,7 @@ def _mask_regions(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
     return kept
 
 
-def predict_readings(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
+def predict_reading_from_others(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
     """Predict the reading of each calibrator sensor from those of the other sensors at the same pose.
 
     Args:

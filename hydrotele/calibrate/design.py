@@ -19,7 +19,7 @@ from hydrotele.calibrate.arm import (
     StageEquations,
     candidate_parameters,
     classify_candidates,
-    expected_error,
+    expected_parameter_error,
     initial_parameters,
 )
 from hydrotele.calibrate.arm_poses import Poses
@@ -30,7 +30,7 @@ from hydrotele.calibrate.loop import (
     solve_calibrator_angles,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import chain_poses_and_rates
+from hydrotele.kinematics.serial_chain import chain_poses_and_derivatives
 
 
 class Sweep(NamedTuple):
@@ -171,8 +171,8 @@ class DesignSurvey(NamedTuple):
     present: Design
 
 
-def evaluate_design(
-    loop: CalibrationLoop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
+def evaluate_calibrator_design(
+    loop: CalibrationLoop, arm: float, forearm: float, ball_x: float, ball_z: float, max_angle_error: float
 ) -> Design:
     """Evaluate how accurately a calibrator of given dimensions would calibrate the arm.
 
@@ -184,7 +184,7 @@ def evaluate_design(
         forearm: length from elbow to ball [m].
         ball_x: position of the ball joint in front of the swing axis [m].
         ball_z: height of the ball joint above the boom pin [m].
-        accuracy: bound of a sensor's uniform error [rad].
+        max_angle_error: bound of a sensor's uniform error [rad].
 
     Returns:
         The design with its figures of merit.
@@ -192,7 +192,7 @@ def evaluate_design(
     values = loop.values.copy()
     values[-2, 3], values[-1, 2] = arm, forearm
     loop = replace(loop, values=values, ball=np.array([ball_x, loop.ball[1], ball_z]))
-    sigma = np.full(len(loop) - loop.powered_count, accuracy / np.sqrt(3.0))
+    sigma = np.full(len(loop) - loop.powered_count, max_angle_error / np.sqrt(3.0))
     stages, reached = [], []
     for link, sweep in DRIFT_FREE_SWEEPS.items():
         clean = generate_sweep_poses(loop, link, sweep._replace(poses=_POSES_PER_LINK))
@@ -203,14 +203,14 @@ def evaluate_design(
         own = {n: shown[:, k] for k, n in enumerate(loop.links[: loop.powered_count])}
         stages.append(Poses(link, shown[:, loop.powered_count :], sigma, own))
     names, matrix = _stacked_jacobian(loop, stages)
-    sizes = np.array([expected_error(loop, name) for name in names])
+    sizes = np.array([expected_parameter_error(loop, name) for name in names])
     scaled = matrix * sizes
     covariance = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14) * np.outer(sizes, sizes)
     own = [k for k, n in enumerate(names) if not n.startswith("p_")
            and n.partition(".")[2] in loop.links[: loop.powered_count]]  # fmt: skip
     part = covariance[np.ix_(own, own)] / np.outer(sizes[own], sizes[own])
     information = -float(np.linalg.slogdet(part)[1])
-    tip = _tip_error(loop, names, covariance)
+    tip = _tip_position_std(loop, names, covariance)
     return Design(arm, forearm, ball_x, ball_z, tip, information, float(np.mean(reached)))
 
 
@@ -226,12 +226,12 @@ def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[
     for poses in stages:
         equations = StageEquations(loop, poses)
         _, by, sensed = equations.residual_and_jacobian(numbers)
-        rows = equations.whitening_factors(sensed) @ equations.select_columns(by, names)
+        rows = equations.whitening_factors(sensed) @ equations.select_parameter_derivatives(by, names)
         parts.append(rows.reshape(-1, len(names)))
     return names, np.vstack(parts)
 
 
-def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
+def _tip_position_std(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
     """Return the uncertainty of the arm's tip position due to a parameter covariance (p, p) [m].
 
     It is the root mean square standard deviation over a few arm poses.
@@ -240,7 +240,7 @@ def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) 
     chain = link_chain(loop.values[:count])
     total = 0.0
     for boom, stick in _TIP_POSES:
-        rates = chain_poses_and_rates(chain, np.array([[0.0, boom, stick][:count]]))
+        rates = chain_poses_and_derivatives(chain, np.array([[0.0, boom, stick][:count]]))
         by = rates.position_by_parameter[0].reshape(3, count, 5)
         slope = np.zeros((3, len(names)))
         for column, name in enumerate(names):
@@ -252,7 +252,7 @@ def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) 
     return float(np.sqrt(total / len(_TIP_POSES)))
 
 
-def survey_designs(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
+def evaluate_design_grid(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
     """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint where it is.
 
     Args:
@@ -263,9 +263,13 @@ def survey_designs(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
         The designs, ordered by forearm length, and the present design.
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
-    grid = [evaluate_design(loop, float(a), float(f), x, z, accuracy) for f in FOREARM_LENGTHS for a in ARM_LENGTHS]
+    grid = [
+        evaluate_calibrator_design(loop, float(a), float(f), x, z, accuracy)
+        for f in FOREARM_LENGTHS
+        for a in ARM_LENGTHS
+    ]
     arm, forearm = float(loop.values[-2, 3]), float(loop.values[-1, 2])
-    present = evaluate_design(loop, arm, forearm, x, z, accuracy)
+    present = evaluate_calibrator_design(loop, arm, forearm, x, z, accuracy)
     return DesignSurvey(tuple(grid), present)
 
 
@@ -287,7 +291,7 @@ def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float
     start = min(reaching or [survey.present], key=lambda d: d.tip_error)
 
     def cost(x):
-        found = evaluate_design(loop, x[0], x[1], x[2], x[3], accuracy)
+        found = evaluate_calibrator_design(loop, x[0], x[1], x[2], x[3], accuracy)
         return np.log(found.tip_error) + 50.0 * max(0.0, _MIN_REACHED_FRACTION - found.reached)
 
     bounds = [(1.5, 4.8), (1.5, 5.2), (1.0, 2.6), (-1.3, -0.6)]
@@ -297,7 +301,7 @@ def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float
         options={"maxfev": 120, "xatol": 0.02, "fatol": 1e-3},
     )  # fmt: skip
     arm, forearm, ball_x, ball_z = found.x.tolist()
-    return evaluate_design(loop, arm, forearm, ball_x, ball_z, accuracy)
+    return evaluate_calibrator_design(loop, arm, forearm, ball_x, ball_z, accuracy)
 
 
 Criterion = Literal["D", "O1", "O2", "O3", "O4", "O5"]

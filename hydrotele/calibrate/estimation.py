@@ -178,7 +178,7 @@ def least_squares(
     free = np.ones(len(begin), bool) if select == "none" else _representative_mask(told)
     if prior is not None:
         free |= np.isfinite(prior.std)
-    _check_count(len(rows), int(free.sum()), prior is not None, known)
+    _check_equation_count(len(rows), int(free.sum()), prior is not None, known)
     noise, searched = 1.0, _SearchState(begin)
     while True:
         search = _ScaledProblem(problem, weight / noise, prior, free)
@@ -389,11 +389,11 @@ def _to_dense(matrix) -> np.ndarray:
     return np.asarray(matrix.toarray() if scipy.sparse.issparse(matrix) else matrix, float)
 
 
-def _group_columns(hits: np.ndarray) -> np.ndarray:
+def _group_columns(sparsity: np.ndarray) -> np.ndarray:
     """Assign the columns of a mask (m, p) to groups without a common row; return group numbers (p,)."""
     groups: list[int] = []
     taken: list[np.ndarray] = []
-    for column in hits.T:
+    for column in sparsity.T:
         group = next((g for g, used in enumerate(taken) if not (used & column).any()), len(taken))
         if group == len(taken):
             taken.append(np.zeros(len(column), bool))
@@ -419,7 +419,7 @@ class _ScaledProblem:
             self.prior_weight, self.mean = self.scales / std[self.free], mean[self.free]
         self.has_prior = self.prior_weight > 0.0
 
-    def all_parameters(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def add_scaled_step(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return base values (p,) with steps `u`, in units of the scales, added to the free parameters."""
         x = base.copy()
         x[self.free] += u * self.scales
@@ -469,14 +469,14 @@ def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps:
     """Run SciPy's Levenberg-Marquardt search, limited to 10 `max_steps` residual evaluations."""
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
-        lambda u: search.weighted_residual(search.all_parameters(base, u)), np.zeros(len(search.free)),
-        jac=lambda u: search.weighted_jacobian(problem.jacobian(search.all_parameters(base, u))),  # type: ignore
+        lambda u: search.weighted_residual(search.add_scaled_step(base, u)), np.zeros(len(search.free)),
+        jac=lambda u: search.weighted_jacobian(problem.jacobian(search.add_scaled_step(base, u))),  # type: ignore
         method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * max_steps,
     )  # fmt: skip
     good = found.status > 0
     said = "converged" if good else f"not converged after {max_steps} steps: increase max_iterations"
     return _SearchState(
-        search.all_parameters(base, found.x), begin.iterations + int(found.njev),
+        search.add_scaled_step(base, found.x), begin.iterations + int(found.njev),
         begin.evaluations + int(found.nfev), good, said,
     )  # fmt: skip
 
@@ -502,7 +502,7 @@ def _minimize_truncated(
             kept = s > share * s[0]
             step = -v[kept].T @ ((u.T @ rows)[kept] / s[kept])
             for _ in range(_MAX_HALVINGS):
-                new = search.all_parameters(x, step)
+                new = search.add_scaled_step(x, step)
                 tried = search.weighted_residual(new)
                 evaluations += 1
                 if tried @ tried < rows @ rows:
@@ -561,7 +561,7 @@ def _remove_scales(identifiability: Identifiability, sizes: np.ndarray) -> Ident
     )
 
 
-def _check_count(equations: int, unknowns: int, prior: bool, known: bool) -> None:
+def _check_equation_count(equations: int, unknowns: int, prior: bool, known: bool) -> None:
     needed = 1 if prior else unknowns + (0 if known else 1)
     if equations < needed:
         raise InputError(

@@ -17,7 +17,7 @@ import scipy.optimize
 
 from hydrotele.calibrate.arm import ArmFit, StageEquations
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position, frame_after_links
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position_from_axis, frame_after_links
 
 _MAX_ALTERNATIONS = 3  # alternations of noise model and parameters; the third changes the f_k by below 1 %
 _MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far above that of any calibrator
@@ -40,7 +40,7 @@ class Flexibility(NamedTuple):
     log_likelihood_gain: float
 
 
-def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
+def relative_lever_arms(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
     """Compute the relative load of each calibrator joint: horizontal distance to the ball over maximum reach.
 
     Returns:
@@ -56,7 +56,7 @@ def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
             angles[:, k] = poses.manipulator[link] + loop.values[k, 0]
     origin, rotation = frame_after_links(fit.loop, place, angles)
     ball = np.einsum("mji,mj->mi", rotation, fit.loop.ball - origin)
-    along = ball_position(chain, place, theta)
+    along = ball_position_from_axis(chain, place, theta)
     angles[:, place] = np.arctan2(ball[:, 1], ball[:, 0]) - np.arctan2(along[:, 1], along[:, 0])
     loads = np.empty((len(poses), len(loop) - loop.powered_count))
     lengths = np.hypot(chain.values[loop.powered_count :, 2], chain.values[loop.powered_count :, 3])
@@ -67,13 +67,13 @@ def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
     return np.minimum(loads, 1.0)
 
 
-def add_flexibility(loop: CalibrationLoop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
+def add_flexibility_to_noise(loop: CalibrationLoop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
     """Return poses whose sensor noise includes the bending of the calibrator's joints under load.
 
     The noise `sigma` (M, S) is the sensors' own and the flexibility (S,) [rad] times the relative load,
     added as squares.
     """
-    loads = joint_loads(loop, poses, fit)
+    loads = relative_lever_arms(loop, poses, fit)
     return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
 
 
@@ -94,12 +94,12 @@ def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: Ar
         error, _, by = equations.residual_and_jacobian(fit.parameters)
         errors.append(error)
         sensed.append(by)
-        loads.append(joint_loads(loop, poses, fit))
+        loads.append(relative_lever_arms(loop, poses, fit))
         sigma.append(np.broadcast_to(poses.sigma, loads[-1].shape))
     error, by = np.concatenate(errors), np.concatenate(sensed)
     load, known = np.concatenate(loads), np.concatenate(sigma)
 
-    def cost(x: np.ndarray) -> float:
+    def negative_log_likelihood(x: np.ndarray) -> float:
         variance = known**2 + (x * load) ** 2
         c = np.einsum("mis,ms,mjs->mij", by, variance, by) + StageEquations.MIN_DEVIATION**2 * np.eye(2)
         whole = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2
@@ -109,11 +109,11 @@ def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: Ar
 
     count = load.shape[1]
     found = scipy.optimize.minimize(
-        lambda u: cost(u * _START_FLEXIBILITY), np.ones(count), method="L-BFGS-B",
+        lambda u: negative_log_likelihood(u * _START_FLEXIBILITY), np.ones(count), method="L-BFGS-B",
         bounds=[(0.0, _MAX_FLEXIBILITY / _START_FLEXIBILITY)] * count,
     )  # fmt: skip
     at_full_load = found.x * _START_FLEXIBILITY
-    gain = cost(np.zeros(count)) - cost(at_full_load)
+    gain = negative_log_likelihood(np.zeros(count)) - negative_log_likelihood(at_full_load)
     return Flexibility(loop.links[loop.powered_count :], at_full_load, gain)
 
 
@@ -133,6 +133,6 @@ def refit_with_flexibility(
     """
     found = estimate_flexibility(loop, stages, fit)
     for _ in range(_MAX_ALTERNATIONS):
-        fit = refit([add_flexibility(loop, p, fit, found.at_full_load) for p in stages])
+        fit = refit([add_flexibility_to_noise(loop, p, fit, found.at_full_load) for p in stages])
         found = estimate_flexibility(loop, stages, fit)
     return fit, found

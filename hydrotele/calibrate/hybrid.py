@@ -32,7 +32,7 @@ from hydrotele.kinematics.hybrid import (
     ErrorModelKind,
     HybridRobot,
     UnreachableError,
-    apply_errors,
+    apply_geometry_errors,
     build_error_model,
     forward_kinematics,
     pose_difference,
@@ -74,7 +74,7 @@ class PoseEquations:
         """(q,) scales of the free parameters."""
         return self.model.scales[self.model.parameter_indices(self.names)]
 
-    def expand_errors(self, values: np.ndarray) -> np.ndarray:
+    def expand_to_all_parameters(self, values: np.ndarray) -> np.ndarray:
         """Expand (..., q) free errors to errors of all parameters (..., p)."""
         values = np.asarray(values, float)
         whole = np.zeros((*values.shape[:-1], len(self.model.names)))
@@ -91,7 +91,9 @@ class PoseEquations:
             (W, 6 N), of unit standard deviation if the noise is known.
         """
         m = self.measurement
-        away = predict_leg_readings(self.model, self.expand_errors(values), m.joints, m.pose.rotation, m.pose.position)
+        away = predict_leg_readings(
+            self.model, self.expand_to_all_parameters(values), m.joints, m.pose.rotation, m.pose.position
+        )
         away -= m.legs
         return np.matmul(self.whitening, away[..., None])[..., 0].reshape(len(away), -1)
 
@@ -198,7 +200,7 @@ def _explain_redundancy(eq: PoseEquations, identifiability: Identifiability, hel
         others = [k for k in np.flatnonzero(identifiability.combination[row]) if k != base]
         if others:
             words.append(f"identifiable only together: {identifiability.format_combination(row)}")
-    carriage = [n for n in partners if n in model.names[: model.carriage_count]]
+    carriage = [n for n in partners if n in model.names[: model.carriage_parameter_count]]
     own = {f"{part}{last}" for part in ("theta", "d", "a", "alpha")}
     if carriage and model.kind == "dh" and set(carriage) <= own and held:
         if all(n[0] == "a" for n in partners if n not in carriage):
@@ -289,7 +291,7 @@ class Calibration:
     @property
     def parameter_errors(self) -> np.ndarray:
         """(p,) identified errors of all parameters, zero for held parameters."""
-        return self.equations.expand_errors(self.fit.values)
+        return self.equations.expand_to_all_parameters(self.fit.values)
 
 
 def calibrate_hybrid_robot(
@@ -326,7 +328,7 @@ def calibrate_hybrid_robot(
         wrong.append(int(eq.measurement.rows[suspect]))
         kept = np.arange(len(eq.measurement)) != suspect
         eq = build_equations(model, eq.measurement.subset(kept), names)
-    calibrated = apply_errors(model, eq.expand_errors(fit.values))
+    calibrated = apply_geometry_errors(model, eq.expand_to_all_parameters(fit.values))
     return Calibration(
         model, eq, fit, find_redundancy(eq, fit.values), calibrated,
         pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
@@ -459,7 +461,7 @@ def _leave_one_out_errors(eq: PoseEquations, fit: ParameterFit) -> PoseErrors:
         step = np.linalg.solve(r, q[k].T @ np.linalg.solve(inside, residual[k]))
         values = fit.values.copy()
         values[free] += step * fit.scales[free]
-        robot = apply_errors(eq.model, eq.expand_errors(values))
+        robot = apply_geometry_errors(eq.model, eq.expand_to_all_parameters(values))
         try:
             found = pose_errors(robot, eq.measurement.subset(np.array([k])))
         except InputError:  # without this pose, the calibration is not valid there
@@ -469,7 +471,7 @@ def _leave_one_out_errors(eq: PoseEquations, fit: ParameterFit) -> PoseErrors:
     return PoseErrors(*(result[:, known] if known.any() else result))
 
 
-def fitted_equations(calibration: Calibration) -> PoseEquations:
+def restrict_to_fitted_parameters(calibration: Calibration) -> PoseEquations:
     """Return a calibration's equations with only the parameters that were fitted, without held ones."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))

@@ -30,7 +30,7 @@ from hydrotele.core.datafile import (
 )
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
-from hydrotele.core.units import to_si
+from hydrotele.core.units import si_unit_and_factor
 from hydrotele.kinematics.hybrid import (
     LEG_COUNT,
     REVOLUTE,
@@ -249,7 +249,7 @@ def _read_columns(table: Table, robot: HybridRobot, facts: MeasurementSpec) -> d
             said = f"is {values[wrong[0]]}: remove the row or measure the pose again"
             raise InputError(table.location(name, int(wrong[0])), said)
         needed = "rad" if name in angles else "m"
-        si, factor = to_si(unit) if unit else (needed, 1.0)
+        si, factor = si_unit_and_factor(unit) if unit else (needed, 1.0)
         if si != needed and name not in COVARIANCE_COLUMNS:
             like = "rad, deg or mrad" if needed == "rad" else "m or mm"
             raise InputError(table.location(name), f"has the unit {unit!r}, but needs {like}")
@@ -397,7 +397,7 @@ def save_measurement(
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def measurement_text(robot: str, wires: WireGeometry | None, noise: Mapping[str, float]) -> str:
+def format_measurement_yaml(robot: str, wires: WireGeometry | None, noise: Mapping[str, float]) -> str:
     """Return the YAML text of `measurement.yaml`: robot, wires and noise, in mm and degrees.
 
     Args:

@@ -16,7 +16,7 @@ import numpy as np
 from hydrotele.calibrate.arm import ArmFit, StageEquations
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.estimation import ParameterFit, least_squares
-from hydrotele.calibrate.loop import ball_position, frame_after_links
+from hydrotele.calibrate.loop import ball_position_from_axis, frame_after_links
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import with_value
 from hydrotele.kinematics.from_machine import axis_linkage
@@ -214,7 +214,7 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
     return with_value(machine, f"axes.{found.axis}.cylinder", cylinder)
 
 
-def identify_joint_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
+def compute_angles_from_calibrator(fit: ArmFit, poses: Poses) -> np.ndarray:
     """Compute the moving joint's angle at every pose from the calibrator's readings alone.
 
     The ball's direction relative to the joint's axis rotates opposite to the joint. Its zero is
@@ -230,7 +230,7 @@ def identify_joint_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
     loop = fit.nominal
     equations = StageEquations(loop, poses)
     seen, theta = equations.chain_and_angles(fit.parameters)
-    s = ball_position(seen, equations.place, theta)
+    s = ball_position_from_axis(seen, equations.place, theta)
     angle = -np.unwrap(np.arctan2(s[:, 1], s[:, 0]))
     origin, turn = frame_after_links(fit.loop, equations.place, loop.home[None])
     ball = turn[0].T @ (fit.loop.ball - origin[0])

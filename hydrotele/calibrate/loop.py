@@ -18,7 +18,7 @@ from hydrotele.kinematics.serial_chain import (
     Element,
     SerialChain,
     chain_poses,
-    chain_poses_and_rates,
+    chain_poses_and_derivatives,
 )
 from hydrotele.machine.machine import Machine
 
@@ -142,7 +142,7 @@ def frame_after_links(loop: CalibrationLoop, count: int, theta: np.ndarray) -> t
     return chain_poses(link_chain(loop.values[:count]), theta[:, :count])
 
 
-def ball_position(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.ndarray:
+def ball_position_from_axis(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.ndarray:
     """Compute the ball position in the frame of joint axis `first`, without that joint's angle.
 
     Args:
@@ -157,7 +157,9 @@ def ball_position(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.nd
     return chain_poses(link_chain(loop.values[first:]), angles).position
 
 
-def ball_position_and_rates(loop: CalibrationLoop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ball_position_and_derivatives(
+    loop: CalibrationLoop, first: int, theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Compute the ball position in the frame of a joint axis, and its derivatives by link parameters.
 
     The joint's own angle is taken as 0.
@@ -175,7 +177,7 @@ def ball_position_and_rates(loop: CalibrationLoop, first: int, theta: np.ndarray
         i .. N; the derivative by the offset of link i is that by a rotation of joint i.)
     """
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
-    found = chain_poses_and_rates(link_chain(loop.values[first:]), angles)
+    found = chain_poses_and_derivatives(link_chain(loop.values[first:]), angles)
     by = found.position_by_parameter.reshape(len(theta), 3, len(loop) - first, 5)
     return found.position, by[..., _CHAIN_TO_KINDS]
 
@@ -190,7 +192,7 @@ def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray,
     Returns:
         (end of chain minus ball (M, 3) in frame 0 [m], derivatives (M, 3, N) [m/rad]).
     """
-    place, by = ball_position_and_rates(loop, 0, theta[:, 1:])
+    place, by = ball_position_and_derivatives(loop, 0, theta[:, 1:])
     ct, st = np.cos(theta[:, 0]), np.sin(theta[:, 0])
     turn = np.zeros((len(theta), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = ct, -st, st, ct, 1.0
@@ -198,7 +200,7 @@ def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray,
     return np.einsum("mij,mj->mi", turn, place) - loop.ball, by
 
 
-def close_chain(
+def solve_closing_angles(
     loop: CalibrationLoop, theta: np.ndarray, free: Sequence[int], start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the angles of three joints that close the chain, by Newton's method.

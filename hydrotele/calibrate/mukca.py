@@ -29,10 +29,10 @@ from hydrotele.calibrate.estimation import (
 from hydrotele.calibrate.sockets import Socket, place_names
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import chain_poses, chain_poses_and_rates
+from hydrotele.kinematics.serial_chain import chain_poses, chain_poses_and_derivatives
 from hydrotele.kinematics.serial_robot import (
     SerialRobot,
-    correct_robot,
+    apply_calibrated_parameters,
     correction_derivatives,
     correction_names,
     load_robot,
@@ -62,7 +62,7 @@ class ErrorSizes:
     rounds: int
 
 
-def estimate_sizes(
+def estimate_prior_std_by_kind(
     matrix: np.ndarray, right_hand_side: np.ndarray, kinds: Sequence[str], start: np.ndarray,
     degrees_of_freedom: float, noise: float, known: np.ndarray | None = None,
     known_right_hand_side: np.ndarray | None = None, min_noise: float = 0.0,
@@ -339,7 +339,7 @@ class _SocketProblem:
         """Return the derivatives (equations, p) of the ball positions and socket distances in `residual`."""
         p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
-        rates = chain_poses_and_rates(self.chain, joints, x[:p])
+        rates = chain_poses_and_derivatives(self.chain, joints, x[:p])
         whole = rates.position_by_parameter
         if self.extra:
             whole = np.concatenate([whole, rates.position_by_joint @ self.basis], axis=2)
@@ -351,7 +351,7 @@ class _SocketProblem:
             rows.append((way @ (middle[a] - middle[b]))[None])
         return np.vstack(rows)
 
-    def equation_deviations(self, noise: float) -> np.ndarray:
+    def equation_standard_deviations(self, noise: float) -> np.ndarray:
         """Return the standard deviation of each equation of `residual` [m] for ball noise `noise` [m]."""
         means = [1.0 / self.count[a] + 1.0 / self.count[b] for a, b in self.pairs]
         gaps = np.sqrt(self.options.accuracy**2 + noise**2 * np.array(means))
@@ -389,7 +389,9 @@ def choose_robot(sockets: Sequence[Socket]) -> tuple[SerialRobot, dict[str, floa
     return robots[best], {name: one.distance for name, one in found.items()}
 
 
-def check_robot(robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions | None = None) -> None:
+def check_robot_fits_sockets(
+    robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions | None = None
+) -> None:
     """Raise InputError if a robot's ball positions scatter too much within the sockets.
 
     The scatter of the ball is compared with its travel if the joints moved independently. In a
@@ -449,19 +451,19 @@ def calibrate_sockets(
             of the sockets or needs errors that are not due to manufacturing.
     """
     options = options or SocketOptions()
-    nominal, robot = robot, place_frames_near(robot, sockets)
+    nominal, robot = robot, move_far_frames_near(robot, sockets)
     problem = _SocketProblem(robot, sockets, (), options)
-    _check_count(problem)
+    _check_equation_count(problem)
     robust, gone = _remove_gross_outliers(problem)
     outliers: list[Outlier] = []
     state = None
     for _ in range(_MAX_PASSES):
         problem = _SocketProblem(robot, robust, (), options)
-        state = _iterate_sizes(problem, state)
+        state = _alternate_fit_and_prior(problem, state)
         model, rivals = _select_model(problem, state)
         extra = correction_names(robot, *JOINT_MODELS[model])
         full = _SocketProblem(robot, robust, extra, options)
-        found = _iterate_sizes(full, state if not extra else _extend_state(full, state))
+        found = _alternate_fit_and_prior(full, state if not extra else _extend_state(full, state))
         fresh = _find_outliers(robot, sockets, extra, found.x, found.sizes.noise)
         outliers, names = fresh, {(one.socket, one.line) for one in fresh}
         if names == gone:
@@ -472,18 +474,18 @@ def calibrate_sockets(
     _check_fit(full, fit, found.sizes.noise)
     p = len(full.chain.nominal_values)
     values = dict(zip(full.names, fit.values.tolist(), strict=True))
-    made = correct_robot(robot, values, dict(zip(extra, fit.values[p:].tolist(), strict=True)))
+    made = apply_calibrated_parameters(robot, values, dict(zip(extra, fit.values[p:].tolist(), strict=True)))
     kinds = _parameter_kinds(full)
     sizes = {kind: float(found.sizes.std[kinds.index(kind)]) for kind in dict.fromkeys(kinds) if kind}
     plain = _SocketProblem(robot, sockets, (), options)
-    before = _evaluate_balls(plain, plain.predict_balls(_fit_nominal_ball(plain)))
+    before = _compute_socket_errors(plain, plain.predict_balls(_fit_nominal_ball(plain)))
     return SocketCalibration(
         nominal, made, model, rivals, fit, sizes, found.sizes.noise, before,
         evaluate_robot(made, sockets), tuple(outliers), options,
     )  # fmt: skip
 
 
-def place_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> SerialRobot:
+def move_far_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> SerialRobot:
     """Return the same robot with far joint frames moved along their axes to within the robot's reach.
 
     A frame may lie anywhere on its axis. The factory calibration of robots with parallel axes puts
@@ -528,7 +530,7 @@ def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketError
     """
     problem = _SocketProblem(robot, sockets, tuple(robot.corrections), SocketOptions(distance=None))
     x = np.concatenate([problem.chain.nominal_values, list(robot.corrections.values())])
-    return _evaluate_balls(problem, problem.predict_balls(x))
+    return _compute_socket_errors(problem, problem.predict_balls(x))
 
 
 def predict_held_out_places(
@@ -581,7 +583,7 @@ def predict_held_out_place(
     found = calibrate_sockets(robot, rest, options)
     problem = _SocketProblem(robot, rest, (), SocketOptions(distance=None))
     values = dict(zip(problem.names, _fit_nominal_ball(problem).tolist(), strict=True))
-    nominal = correct_robot(robot, values, {})
+    nominal = apply_calibrated_parameters(robot, values, {})
     return HeldOutPrediction(
         name,
         evaluate_robot(robot, own),
@@ -591,7 +593,7 @@ def predict_held_out_place(
     ), found
 
 
-def held_out_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
+def list_names_to_hold_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
     """Return the names to leave out in turn for validation.
 
     They are the places if there are several, otherwise the sockets; empty for a single socket.
@@ -610,7 +612,7 @@ class _FitState:
     sizes: ErrorSizes
 
 
-def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
+def _alternate_fit_and_prior(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
     """Alternate between a fit of the parameters and an estimate of prior sizes and noise.
 
     It stops when the noise changes by less than 0.1 %.
@@ -625,7 +627,7 @@ def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitStat
     first[np.array(kinds) == ""] = _BALL_PRIOR_STD
     many = 3 * len(problem.joints)
     for _ in range(_MAX_PASSES):
-        sigma = problem.equation_deviations(sizes.noise)
+        sigma = problem.equation_standard_deviations(sizes.noise)
         fit = least_squares(
             problem.residual, x, problem.names, np.maximum(sizes.std, 1e-12), sigma=sigma,
             prior=Prior(problem.start, sizes.std), jac=problem.jacobian, select="none",
@@ -633,7 +635,7 @@ def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitStat
         x, matrix = fit.values, fit.jacobian
         rest = matrix @ (x - problem.start) - fit.residual
         weight = 1.0 / sigma[many:, None]
-        new = estimate_sizes(
+        new = estimate_prior_std_by_kind(
             matrix[:many], rest[:many], kinds, first, problem.degrees_of_freedom, sizes.noise,
             matrix[many:] * weight, rest[many:] * weight[:, 0], _MIN_NOISE,
         )  # fmt: skip
@@ -646,7 +648,7 @@ def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitStat
 
 def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
     """Fit the parameters with the estimated noise and prior sizes, and classify their identifiability."""
-    sigma = problem.equation_deviations(state.sizes.noise)
+    sigma = problem.equation_standard_deviations(state.sizes.noise)
     fit = least_squares(
         problem.residual, state.x, problem.names, np.maximum(state.sizes.std, 1e-12), sigma=sigma,
         prior=Prior(problem.start, state.sizes.std), jac=problem.jacobian, select="none",
@@ -708,7 +710,7 @@ def _fit_nominal_ball(problem: _SocketProblem) -> np.ndarray:
     """Return nominal parameters with the ball position fitted so that it scatters least in the sockets."""
     x = problem.start.copy()
     places = [problem.names.index(f"{c}.tool") for c in "xyz"]
-    rates = chain_poses_and_rates(problem.chain, problem.joints, problem.chain.nominal_values)
+    rates = chain_poses_and_derivatives(problem.chain, problem.joints, problem.chain.nominal_values)
     ball = rates.position_by_parameter[:, :, places]
     apart = problem.subtract_means(rates.position).ravel()
     matrix = (ball - problem.socket_means(ball)[problem.index]).reshape(-1, 3)
@@ -784,7 +786,7 @@ def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None
     """Raise InputError if a fit contradicts the stated socket distance, or an error is implausibly large."""
     folder = problem.sockets[0].path.parent
     many = 3 * len(problem.joints)
-    gaps, sigma = fit.residual[many:], problem.equation_deviations(noise)[many:]
+    gaps, sigma = fit.residual[many:], problem.equation_standard_deviations(noise)[many:]
     for (a, b), gap, deviation in zip(problem.pairs, gaps, sigma, strict=True):
         if abs(gap) > _MAX_FITTED_DISTANCE_SIGMAS * deviation:
             found = 1e3 * (problem.options.distance + gap)
@@ -831,8 +833,8 @@ def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[
         begun = state if not extra else _extend_state(full, state)
         matrix, left = full.jacobian(begun.x), full.residual(begun.x)
         rest = matrix @ (begun.x - full.start) - left
-        weight = 1.0 / full.equation_deviations(state.sizes.noise)[many:]
-        sizes = estimate_sizes(
+        weight = 1.0 / full.equation_standard_deviations(state.sizes.noise)[many:]
+        sizes = estimate_prior_std_by_kind(
             matrix[:many], rest[:many], _parameter_kinds(full), begun.sizes.std, full.degrees_of_freedom,
             state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _MIN_NOISE,
         )  # fmt: skip
@@ -905,7 +907,7 @@ def _remove_rows(sockets: Sequence[Socket], gone: set[tuple[str, int]]) -> tuple
     return tuple(made)
 
 
-def _evaluate_balls(problem: _SocketProblem, balls: np.ndarray) -> SocketErrors:
+def _compute_socket_errors(problem: _SocketProblem, balls: np.ndarray) -> SocketErrors:
     apart = np.linalg.norm(problem.subtract_means(balls), axis=1)
     noise = float(np.median(apart)) / _MEDIAN_CHI3
     outliers = _outlier_rows(problem, balls, noise)
@@ -944,7 +946,7 @@ def _neighbour_pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
     ]  # fmt: skip
 
 
-def _check_count(problem: _SocketProblem) -> None:
+def _check_equation_count(problem: _SocketProblem) -> None:
     needed = 4 * len(problem.robot.joints)
     if problem.degrees_of_freedom < needed:
         raise InputError(

@@ -210,13 +210,13 @@ def _arbitrary_geometry(
     """Generate random transforms (4, 4) of links and joints, by name, for which all loops are closed."""
     links, state = {}, {}
     for name, joint in mechanism.joints.items():
-        state[name] = _exponential(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, 1.0))
+        state[name] = _pose_from_rotation_and_shift(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, 1.0))
     for chain in mechanism.chains:
         for link in chain.links:
             twist = np.r_[rng.uniform(-1.0, 1.0, 3), rng.uniform(-0.5, 0.5, 3)]
             if link in mechanism.straight_links:
                 twist = np.array([0, 0, 0, 0, 0, 0.7])
-            links.setdefault(link, _exponential(twist))
+            links.setdefault(link, _pose_from_rotation_and_shift(twist))
     goal = _chain_pose(mechanism.chains[0], links, state)
     for chain in mechanism.chains[1:]:
         end = np.linalg.inv(_chain_pose(chain, links, state)) @ goal
@@ -231,7 +231,8 @@ def _random_coordinates(rng: np.random.Generator, kind: JointKind, size: float) 
 def _move_joints(mechanism, state, rng, motion, unmoved) -> dict[str, np.ndarray]:
     return {
         name: state[name] if name in unmoved
-        else state[name] @ _exponential(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, motion))
+        else state[name]
+        @ _pose_from_rotation_and_shift(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, motion))
         for name, joint in mechanism.joints.items()
     }  # fmt: skip
 
@@ -258,7 +259,7 @@ def _close_loops(mechanism, links, state, unmoved) -> dict[str, np.ndarray]:
         for name in free:
             subspace = _SUBSPACES[mechanism.joints[name].kind]
             size = subspace.shape[1]
-            state[name] = state[name] @ _exponential(subspace @ step[at : at + size])
+            state[name] = state[name] @ _pose_from_rotation_and_shift(subspace @ step[at : at + size])
             at += size
     raise ValueError(f"mechanism {mechanism.name}: the loops do not close: use a smaller motion")
 
@@ -317,7 +318,7 @@ def _adjoint(pose: np.ndarray) -> np.ndarray:
     return result
 
 
-def _exponential(twist: np.ndarray) -> np.ndarray:
+def _pose_from_rotation_and_shift(twist: np.ndarray) -> np.ndarray:
     """Return the transform (4, 4) with the rotation vector `twist[:3]` and the translation `twist[3:]`."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()

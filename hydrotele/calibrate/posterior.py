@@ -77,21 +77,21 @@ def minimize_by_evolution(
     history: list[float] = []
     evaluations = 0
 
-    def batch(x: np.ndarray) -> np.ndarray:
+    def evaluate_population(x: np.ndarray) -> np.ndarray:
         nonlocal evaluations  # SciPy counts a whole population as one evaluation
         evaluations += x.shape[1] if x.ndim == 2 else 1
         found = cost(np.ascontiguousarray(x.T) if x.ndim == 2 else x[None])
         return found if x.ndim == 2 else found[0]
 
-    def watch(intermediate_result) -> bool:
+    def record_and_check_convergence(intermediate_result) -> bool:
         history.append(float(intermediate_result.fun))
         return bool(np.ptp(intermediate_result.population_energies) < cost_tolerance)
 
     found = differential_evolution(
-        batch, list(zip(low, high, strict=True)), strategy="randtobest1bin",
+        evaluate_population, list(zip(low, high, strict=True)), strategy="randtobest1bin",
         mutation=(0.4, 0.9), recombination=0.95, popsize=population, maxiter=generations, tol=0.0,
         polish=False, init="latinhypercube", rng=np.random.default_rng(seed), vectorized=True,
-        updating="deferred", callback=watch,
+        updating="deferred", callback=record_and_check_convergence,
     )  # fmt: skip
     return EvolutionResult(found.x, float(found.fun), int(found.nit), evaluations,
                      len(history) > 0 and found.nit < generations, np.array(history))  # fmt: skip

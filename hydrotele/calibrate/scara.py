@@ -22,7 +22,7 @@ from hydrotele.kinematics.serial_chain import (
     Element,
     SerialChain,
     chain_poses,
-    chain_poses_and_rates,
+    chain_poses_and_derivatives,
 )
 
 MEASURED_FILE, NOMINAL_FILE = "measured.csv", "nominal.yaml"
@@ -196,8 +196,8 @@ def fit_scara(chain: SerialChain, measured: MeasuredPositions, poses: Sequence[i
 
     return least_squares(
         lambda x: (chain_poses(chain, joints, insert_parameters(x)).position[:, :2] - ends).ravel(),
-        chain.nominal_values[places], names, _scales(names),
-        jac=lambda x: chain_poses_and_rates(chain, joints, insert_parameters(x))
+        chain.nominal_values[places], names, _parameter_scales(names),
+        jac=lambda x: chain_poses_and_derivatives(chain, joints, insert_parameters(x))
         .position_by_parameter[:, :2][:, :, places].reshape(-1, len(places)),
     )  # fmt: skip
 
@@ -214,8 +214,8 @@ def select_scara_poses(nominal: ScaraSpec, measured: MeasuredPositions, count: i
         The selection.
     """
     chain = scara_chain(nominal)
-    rates = chain_poses_and_rates(chain, measured.joints).position_by_parameter[:, :2]
-    return select_poses(rates * _scales(chain.parameters), count)
+    rates = chain_poses_and_derivatives(chain, measured.joints).position_by_parameter[:, :2]
+    return select_poses(rates * _parameter_scales(chain.parameters), count)
 
 
 def simulate_scara(
@@ -250,7 +250,7 @@ def save_scara(folder: Path, nominal: ScaraSpec, measured: MeasuredPositions) ->
                fmt="%.9f")  # fmt: skip
 
 
-def _scales(names: Sequence[str]) -> np.ndarray:
+def _parameter_scales(names: Sequence[str]) -> np.ndarray:
     return np.array([_SCALES[name.partition(".")[0]] for name in names])
 
 

@@ -18,10 +18,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text, resolve_path
 from hydrotele.kinematics.serial_robot import (
     SerialRobot,
-    correct_robot,
+    apply_calibrated_parameters,
+    compute_ball_poses,
     robot_chain,
-    robot_poses,
-    solve_ball_positions,
+    solve_joints_for_ball,
 )
 
 _FILE_PATTERN = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
@@ -209,7 +209,7 @@ def add_random_errors(
         if joint == "tool":
             size = errors.ball
         values[name] = float(nominal + size * rng.standard_normal())
-    return correct_robot(robot, values, corrections or {}), values
+    return apply_calibrated_parameters(robot, values, corrections or {}), values
 
 
 def simulate_sockets(
@@ -274,10 +274,10 @@ def _solve_postures(
         start = rng.uniform(-limit, limit, (4 * rows, len(robot.joints)))
         if idle is not None:
             start[:, idle] = _IDLE_ANGLE
-        near = np.linalg.norm(robot_poses(robot, start).position - middle, axis=1)
+        near = np.linalg.norm(compute_ball_poses(robot, start).position - middle, axis=1)
         start = start[np.argsort(near)[: 2 * rows]]
         targets = middle + errors.play * rng.standard_normal((len(start), 3))
-        reached = solve_ball_positions(robot, targets, start, idle=idle)
+        reached = solve_joints_for_ball(robot, targets, start, idle=idle)
         good = (reached.remaining_distance < _MAX_BALL_ERROR) & (np.abs(reached.joints).max(axis=1) < limit)
         found += list(reached.joints[good])
         if len(found) >= rows:

@@ -45,14 +45,14 @@ from hydrotele.teleop.findings import (
     describe_stability,
     findings_to_dict,
     format_delay,
-    format_error,
-    format_factor,
+    format_gain_margin,
     format_number,
+    format_relative_error,
     scenario_findings_to_dict,
 )
-from hydrotele.teleop.linear_case import build_scenario_case, scenario_joystick
+from hydrotele.teleop.linear_case import build_scenario_case, find_scenario_joystick
 from hydrotele.teleop.robust import case_impedance_ranges, evaluate_robustness
-from hydrotele.teleop.round_trip import load_delays
+from hydrotele.teleop.round_trip import load_packet_delays
 from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
     PacketAges,
@@ -169,7 +169,7 @@ def analyse_case(
     reach = specification.map
     delays = max(reach.max_delay, case.delay) * np.linspace(0.0, 1.0, reach.points) ** 2
     factors = np.geomspace(reach.min_factor, reach.max_factor, reach.points)
-    spring = specification.stiffness.to_spring() if specification.stiffness else None
+    spring = specification.stiffness.to_stiffness_axis() if specification.stiffness else None
     linear = tuple(name for name in names if name in STRUCTURES) if names else specification.structures
     with show_stages(f"analyse {specification.name}", quiet) as progress:
         found = analyse_structures(specification.name, case, linear, delays, factors, spring, confirm, progress)
@@ -199,7 +199,7 @@ def _packet_ages(case: TeleoperatorAxis, robustness_options: RobustnessOptions) 
         raise InputError("--operators", f"must be from 1 to 10000, got {robustness_options.operators}")
     if robustness_options.delays is None:
         return constant_delay_ages(robustness_options.period, case.delay_forward, case.delay_back)
-    return measured_delay_ages(robustness_options.period, *load_delays(robustness_options.delays))
+    return measured_delay_ages(robustness_options.period, *load_packet_delays(robustness_options.delays))
 
 
 def _write(folder: Path, findings: TeleopFindings, document: dict) -> None:
@@ -227,15 +227,15 @@ def _print(findings: TeleopFindings) -> None:
     for one in findings.analyses:
         rows.add_row(
             one.structure, _color_verdict(describe_stability(one)), _color_verdict(describe_stability(one, True)),
-            format_factor(one.gain_margin), format_delay(one.max_delay),
+            format_gain_margin(one.gain_margin), format_delay(one.max_delay),
             f"{one.scattering_norms.max():.3g}", "yes" if one.has_passive_port else "no",
         )  # fmt: skip
     stdout_console.print(rows)
     stdout_console.print(_STABILITY_LEGEND, style="dim")
     if findings.spring:
-        _print_case_springs(findings)
+        _print_case_stiffness_feedback(findings)
     if findings.agreements:
-        _print_confirmation(findings)
+        _print_simulation_agreement(findings)
     if findings.robustness_results:
         _print_robustness(findings)
 
@@ -262,22 +262,22 @@ def _print_robustness(found: TeleopFindings) -> None:
             one.structure, *told, f"{worst.pair_count - worst.unstable_count} of {worst.pair_count}",
             f"{worst.pair_count - worst.unstable_released_count} of {worst.pair_count}",
             "-" if math.isnan(one.llewellyn) else f"{one.llewellyn:.3g}",
-            f"{width.decades:.2f}" if width else "-", stiffest,
+            f"{width.mean_width_decades:.2f}" if width else "-", stiffest,
         )  # fmt: skip
     stdout_console.print(rows)
     stdout_console.print(_ROBUST_LEGEND, style="dim")
 
 
-def _print_case_springs(found: TeleopFindings) -> None:
+def _print_case_stiffness_feedback(found: TeleopFindings) -> None:
     assert found.spring
-    _print_spring_table(found.spring.with_hand(found.case.hand), found.spring)
+    _print_stiffness_feedback_table(found.spring.with_hand(found.case.hand), found.spring)
 
 
-def _print_confirmation(found: TeleopFindings) -> None:
+def _print_simulation_agreement(found: TeleopFindings) -> None:
     rows = make_table("confirmed in simulation", "structure", "sweep error, no delay",
                  "sweep error, with delay", "map agreement")  # fmt: skip
     for one in found.agreements:
-        errors = [format_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
+        errors = [format_relative_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
         rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.agreement_fraction:.1f} %")
     stdout_console.print(rows)
     stdout_console.print("sweep error: largest error of the impedance felt by the operator (lower is better);"
@@ -300,7 +300,7 @@ def is_scenario(file: Path | None) -> bool:
         return False
 
 
-def analyse_any_to_folder(
+def analyse_case_or_scenario_to_folder(
     file: Path | None, target: Path | None, structures: list[str] | None, delay: float | None,
     confirm: bool, coordinate: str | None, overrides: dict[str, str], as_json: bool,
     robustness_options: RobustnessOptions | None = None,
@@ -339,7 +339,7 @@ def analyse_scenario(scenario: Scenario, coordinate: str | None = None) -> Scena
         InputError: the scenario has no force-reflection loop.
     """
     machine = load_nominal_machine(scenario)
-    joystick = load_joystick(scenario_joystick(scenario))
+    joystick = load_joystick(find_scenario_joystick(scenario))
     case, contact = build_scenario_case(scenario, machine, joystick, coordinate)
     return analyse_scenario_case(scenario.name, case, contact.source)
 
@@ -379,7 +379,7 @@ def analyse_scenario_to_folder(
     else:
         for label, value, why in format_findings(found):
             stdout_console.print(f"{label}: [bold]{value}[/] {why}".rstrip())
-        _print_spring_table(found.held_spring, found.released_spring)
+        _print_stiffness_feedback_table(found.held_spring, found.released_spring)
         stdout_console.print(f"written to [bold]{target}[/]; open {target}/report.html")
     return target
 
@@ -396,7 +396,7 @@ def format_findings(findings: ScenarioFindings) -> list[tuple[str, str, str]]:
         ("analysed loop", loop.structure,
          "" if loop.is_scenario_structure else "used because the scenario has stiffness feedback or no reflection"),
         ("stable", "yes" if loop.is_stable else f"no, {loop.unstable_poles} unstable poles", ""),
-        ("gain margin", format_factor(loop.gain_margin),
+        ("gain margin", format_gain_margin(loop.gain_margin),
          f"factor on the reflection ratio of {case.ratio:.3g}; higher is better"),
         ("maximum delay", format_delay(loop.max_delay), "one way; higher is better"),
     ]  # fmt: skip
@@ -414,16 +414,16 @@ def format_findings(findings: ScenarioFindings) -> list[tuple[str, str, str]]:
     return [*rows, ("local reflection ratio", f"{findings.deadband_edge_ratio:.3g}", why)]
 
 
-def _print_spring_table(held: StiffnessAxis, free: StiffnessAxis) -> None:
+def _print_stiffness_feedback_table(held: StiffnessAxis, released: StiffnessAxis) -> None:
     rows = make_table("stiffness feedback: margin B^2 - 4 M K_max and worst-case switching", "joystick",
                  "B", "K_min", "K_max", "margin", "B for margin 0", "growth", "B for growth 1",
                  "stable by",
                  )  # fmt: skip
-    for name, one in (("held", held), ("released", free)):
+    for name, one in (("held", held), ("released", released)):
         rows.add_row(
             name, f"{one.damping:g}", f"{one.min_stiffness:g}", f"{one.max_stiffness:g}",
-            format_number(one.theorem_margin),
-            f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}", f"{one.min_stable_damping:.3g}",
+            format_number(one.stability_theorem_margin),
+            f"{one.stability_theorem_damping:.4g}", f"{one.half_swing_growth:.3g}", f"{one.min_stable_damping:.3g}",
             _color_verdict(one.stability_criterion)
             if one.stability_criterion == "nothing" else one.stability_criterion,
         )  # fmt: skip

@@ -72,16 +72,17 @@ def measure_speed(repeats: int) -> dict:
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")
     plant = build_plant(load_machine("cat215", "none"))
-    bare, full = shortest_times(6 * repeats, [_make_mechanism_job(plant), _make_hydraulic_job(plant)])
+    bare, full = measure_shortest_times(6 * repeats, [_make_mechanism_job(plant), _make_hydraulic_job(plant)])
     stderr_console.print("whole scenario ...", style="dim")
-    factor = max(_measure_scenario_factor() for _ in range(max(2, repeats // 2)))
+    factor = max(_measure_scenario_realtime_factor() for _ in range(max(2, repeats // 2)))
     stderr_console.print("teleoperation ...", style="dim")
     turns = max(2, repeats // 2)
     teleoperated = {
-        name: round(max(_measure_teleop_factor(name) for _ in range(turns)), 1) for name in TELEOPERATED_SCENARIOS
+        name: round(max(_measure_teleop_realtime_factor(name) for _ in range(turns)), 1)
+        for name in TELEOPERATED_SCENARIOS
     }
     stderr_console.print("batches ...", style="dim")
-    one, two = shortest_times(max(3, repeats), [_make_batch_job(plant, n) for n in (1, 2)])
+    one, two = measure_shortest_times(max(3, repeats), [_make_batch_job(plant, n) for n in (1, 2)])
     stderr_console.print("start-up ...", style="dim")
     steps = SIMULATIONS * STEPS / 5
     return {
@@ -92,12 +93,12 @@ def measure_speed(repeats: int) -> dict:
         "teleoperation_realtime_factor": teleoperated,
         "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
         "batch_scaling": round(one / two, 3),
-        "help_s": round(min(_measure_start_time("--help") for _ in range(3)), 3),
-        "run_s": round(min(_measure_start_time(*_SHORT_RUN_ARGUMENTS) for _ in range(2)), 3),
+        "help_s": round(min(_measure_command_duration("--help") for _ in range(3)), 3),
+        "run_s": round(min(_measure_command_duration(*_SHORT_RUN_ARGUMENTS) for _ in range(2)), 3),
     }
 
 
-def shortest_times(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
+def measure_shortest_times(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
     """Run jobs alternately and return the shortest time of each [s].
 
     Args:
@@ -131,7 +132,7 @@ def _make_mechanism_job(plant: Plant) -> Callable[[], float]:
 def _make_step_job(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]:
     data = mujoco.MjData(model)
 
-    def job() -> float:
+    def time_steps() -> float:
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = start.qpos, start.qvel
         if model.nu:
@@ -140,7 +141,7 @@ def _make_step_job(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], 
         mujoco.mj_step(model, data, nstep=STEPS)
         return time.perf_counter() - begin
 
-    return job
+    return time_steps
 
 
 def _make_batch_job(plant: Plant, threads: int) -> Callable[[], float]:
@@ -148,17 +149,17 @@ def _make_batch_job(plant: Plant, threads: int) -> Callable[[], float]:
     batch = Batch(plant.model, SIMULATIONS, nthread=threads)
     commands = np.random.default_rng(0).uniform(-0.3, 0.3, (SIMULATIONS, plant.model.nu))
 
-    def job() -> float:
+    def time_batch_steps() -> float:
         batch.qpos[:], batch.qvel[:], batch.act[:] = start.qpos, start.qvel, start.act
         batch.ctrl[:] = commands
         begin = time.perf_counter()
         batch.step(nstep=STEPS // 5)
         return time.perf_counter() - begin
 
-    return job
+    return time_batch_steps
 
 
-def _measure_scenario_factor() -> float:
+def _measure_scenario_realtime_factor() -> float:
     """Return the real-time factor (simulated per computing time) of the shipped scenario `excitation`.
 
     The run includes control, sensors and logging.
@@ -169,7 +170,7 @@ def _measure_scenario_factor() -> float:
     return scenario.duration / (time.perf_counter() - begin)
 
 
-def _measure_teleop_factor(name: str) -> float:
+def _measure_teleop_realtime_factor(name: str) -> float:
     """Return the real-time factor (simulated per computing time) of a teleoperated scenario.
 
     The run includes the models of the operator and of the communication channel.
@@ -177,7 +178,7 @@ def _measure_teleop_factor(name: str) -> float:
     return run_scenario(load_scenario(name)).summary["realtime_factor"]
 
 
-def _measure_start_time(*arguments: str) -> float:
+def _measure_command_duration(*arguments: str) -> float:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:

@@ -131,12 +131,12 @@ def hybrid(
     json: JsonOption = False,
 ) -> None:
     """Calibrate a serial-parallel robot from measured poses (Wang 2012)."""
-    from hydrotele.cli.calibrating_robots import calibrate_hybrid, simulate_hybrid
+    from hydrotele.cli.calibrating_robots import calibrate_hybrid, simulate_hybrid_to_folder
 
     if (data is None) == (simulate is None):
         raise InputError("calibrate hybrid", "give either --data FOLDER or --simulate FOLDER")
     if simulate is not None:
-        simulate_hybrid(simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose)
+        simulate_hybrid_to_folder(simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose)
     elif data is not None:
         calibrate_hybrid(data, robot, model, parameters, evolution, posterior, seed, out, json)
 

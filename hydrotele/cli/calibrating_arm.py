@@ -19,18 +19,18 @@ from hydrotele.calibrate.arm import (
     stage_residuals,
 )
 from hydrotele.calibrate.arm_data import extract_strokes, log_to_poses, read_calibration_logs, split_poses
-from hydrotele.calibrate.arm_poses import Poses, add_drift
+from hydrotele.calibrate.arm_poses import Poses, add_held_link_drift
 from hydrotele.calibrate.bad_data import CorruptedRegion, identify_without_bad_data
 from hydrotele.calibrate.flexibility import (
     Flexibility,
-    add_flexibility,
+    add_flexibility_to_noise,
     refit_with_flexibility,
 )
 from hydrotele.calibrate.linkage import (
     PARAMETER_NAMES,
     AxisStrokes,
     LinkageFit,
-    identify_joint_angles,
+    compute_angles_from_calibrator,
     identify_linkage,
     linkage_parameters,
     machine_with_linkage,
@@ -125,7 +125,7 @@ def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | 
     nominal = load_machine(machine)
     with show_stages("calibrate arm", as_json) as progress:
         result = fit_arm(nominal, data, choices, every, progress or ignore_stage)
-    said = arm_as_data(result)
+    said = arm_result_to_dict(result)
     if target:
         _write(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
     if as_json:
@@ -171,7 +171,7 @@ def fit_arm(
     stages = [log_to_poses(log, nominal, loop, choices.poses, accuracy) for log in logs]
     if choices.drift:
         report("remove the drift of the sensors", 0.1)
-        stages = [add_drift(loop, poses) for poses in stages]
+        stages = [add_held_link_drift(loop, poses) for poses in stages]
     regions: list[CorruptedRegion] = []
     kept = stages
     if choices.bad_data:
@@ -190,7 +190,7 @@ def fit_arm(
         report("fit the links with the flexibility of the calibrator", 0.7)
         fit, flexibility = refit_with_flexibility(loop, fitted, fit, identify)
         bend = flexibility.at_full_load
-        judged = [add_flexibility(loop, poses, fit, bend) for poses in judged]
+        judged = [add_flexibility_to_noise(loop, poses, fit, bend) for poses in judged]
     made = calibrated_machine(nominal, fit, fitted)
     report("predict the held-out poses", 0.9)
     errors = _heldout_errors(loop, fit, judged)
@@ -222,7 +222,7 @@ def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Pose
             "chi": float(np.sqrt(np.mean(np.concatenate(chi) ** 2)))}  # fmt: skip
 
 
-def arm_as_data(result: ArmResult) -> dict[str, Any]:
+def arm_result_to_dict(result: ArmResult) -> dict[str, Any]:
     """Return an arm calibration in the form of `calibration.json`, in SI units."""
     fit = result.fit
     rows = [
@@ -260,11 +260,11 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
         "machine": fit.nominal.machine, "method": fit.method, "parameters": rows,
         "flexibility": flexibility,
         "stages": stages, "bad_data": regions, "heldout": dict(result.heldout_errors),
-        "links_without_log": _links_without_log(fit), "notes": _fit_notes(fit),
+        "links_without_log": _find_links_without_motion(fit), "notes": _list_fit_warnings(fit),
     })  # fmt: skip
 
 
-def _links_without_log(fit: ArmFit) -> dict[str, list[str]]:
+def _find_links_without_motion(fit: ArmFit) -> dict[str, list[str]]:
     """Return {link that moves in no log: its parameters, which keep their nominal values}."""
     moved = {stage.link for stage in fit.stages}
     return {
@@ -276,14 +276,14 @@ def _links_without_log(fit: ArmFit) -> dict[str, list[str]]:
     }  # fmt: skip
 
 
-def _fit_notes(fit: ArmFit) -> list[str]:
+def _list_fit_warnings(fit: ArmFit) -> list[str]:
     said = [
         f"residuals of {s.link} are {s.chi:.1f} times the sensor noise: held links move, joints"
         " bend, or a sensor is worse than stated; the intervals are enlarged by this factor"
         for s in fit.stages
         if s.chi > _MAX_RESIDUAL_RATIO
     ]
-    for link, names in _links_without_log(fit).items():
+    for link, names in _find_links_without_motion(fit).items():
         said.append(f"{link} moves in no log: {', '.join(names)} keep their nominal values")
     return said
 
@@ -367,7 +367,7 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
     with show_stages("calibrate linkage", as_json) as progress:
         fits = fit_linkages(nominal, data, angles, progress or ignore_stage)
     said = to_json_types({"machine": nominal.name, "angles": angles, "axes": {
-        found.axis: linkage_as_data(found) for found in fits}})  # fmt: skip
+        found.axis: linkage_fit_to_dict(found) for found in fits}})  # fmt: skip
     made = nominal
     for found in fits:
         made = machine_with_linkage(made, found)
@@ -416,7 +416,7 @@ def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport 
             if not known or poses.rows is None:
                 continue
             strokes.append(AxisStrokes(
-                poses.link, identify_joint_angles(fit, poses), log[f"length.{poses.link}"][poses.rows],
+                poses.link, compute_angles_from_calibrator(fit, poses), log[f"length.{poses.link}"][poses.rows],
                 float(poses.sigma.max()) * 2.0, known[0].length_sigma, "identified", log.source,
             ))  # fmt: skip
     if not strokes:
@@ -431,7 +431,7 @@ def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport 
     return fits
 
 
-def linkage_as_data(fit: LinkageFit) -> dict[str, Any]:
+def linkage_fit_to_dict(fit: LinkageFit) -> dict[str, Any]:
     """Return a linkage calibration in the form that `--json` prints, in SI units."""
     deviations = dict(zip(fit.fit.names, fit.fit.standard_deviations, strict=True))
     return {
@@ -473,7 +473,7 @@ def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
     """
-    from hydrotele.calibrate.design import optimize_design, survey_designs
+    from hydrotele.calibrate.design import evaluate_design_grid, optimize_design
 
     if target:
         check_output_folder(target, "arm calibration")
@@ -482,7 +482,7 @@ def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as
     with show_stages("calibrate design", as_json) as progress:
         report = progress or ignore_stage
         report("evaluate the designs of a grid", 0.0)
-        survey = survey_designs(loop, float(np.radians(accuracy_deg)))
+        survey = evaluate_design_grid(loop, float(np.radians(accuracy_deg)))
         report("optimise the best design", 0.5)
         best = optimize_design(loop, survey, float(np.radians(accuracy_deg)))
     said = to_json_types({

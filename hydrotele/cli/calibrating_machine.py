@@ -13,10 +13,10 @@ from hydrotele.calibrate.linkage import LinkageFit, machine_with_linkage
 from hydrotele.cli.calibrating_arm import (
     ArmChoices,
     ArmResult,
-    arm_as_data,
+    arm_result_to_dict,
     fit_arm,
     fit_linkages,
-    linkage_as_data,
+    linkage_fit_to_dict,
     write_arm_report,
 )
 from hydrotele.cli.console import (
@@ -116,8 +116,8 @@ def calibrate_machine(
 def _calibration_document(result: MachineCalibration) -> dict[str, Any]:
     return to_json_types({
         "machine": result.arm.machine.name,
-        "arm": arm_as_data(result.arm),
-        "linkages": {found.axis: linkage_as_data(found) for found in result.linkages},
+        "arm": arm_result_to_dict(result.arm),
+        "linkages": {found.axis: linkage_fit_to_dict(found) for found in result.linkages},
         "linkages_skipped": result.linkages_skip_reason,
         "dynamics": build_identify_document(result.dynamics.identification, None, result.dynamics.consistent),
     })  # fmt: skip

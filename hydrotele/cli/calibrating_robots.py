@@ -20,16 +20,16 @@ from hydrotele.calibrate.hybrid import (
     PoseErrors,
     calibrate_best_model,
     calibrate_hybrid_robot,
-    fitted_equations,
     pose_errors,
+    restrict_to_fitted_parameters,
     select_informative_poses,
 )
 from hydrotele.calibrate.hybrid_data import (
     HELDOUT_STEM,
     POSES_STEM,
     find_robot_file,
+    format_measurement_yaml,
     measurement_from_wires,
-    measurement_text,
     read_measurement,
     save_measurement,
 )
@@ -40,9 +40,9 @@ from hydrotele.calibrate.mukca import (
     SocketErrors,
     SocketOptions,
     calibrate_sockets,
-    check_robot,
+    check_robot_fits_sockets,
     choose_robot,
-    held_out_names,
+    list_names_to_hold_out,
     predict_held_out_place,
 )
 from hydrotele.calibrate.posterior import (
@@ -85,7 +85,13 @@ from hydrotele.kinematics.hybrid import (
     refined_model_parameters,
     save_hybrid,
 )
-from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, expand_joints, load_robot, robot_to_yaml
+from hydrotele.kinematics.serial_robot import (
+    SerialRobot,
+    expand_mimic_joints,
+    load_robot,
+    robot_to_yaml,
+    write_origins_to_urdf,
+)
 from hydrotele.kinematics.wires import NoIntersectionError, wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
@@ -150,9 +156,9 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
         check_output_folder(target, "robot calibration")
     sockets, notes = load_sockets(data, choices.unit == "deg")
     options = SocketOptions(choices.distance or None, choices.accuracy, choices.model)
-    robot, said = _find_robot(data, choices.robot, sockets, options)
-    sockets = tuple(replace(one, joints=expand_joints(robot, one.joints)) for one in sockets)
-    check_robot(robot, sockets, options)
+    robot, said = _load_or_choose_robot(data, choices.robot, sockets, options)
+    sockets = tuple(replace(one, joints=expand_mimic_joints(robot, one.joints)) for one in sockets)
+    check_robot_fits_sockets(robot, sockets, options)
     notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
     left: list[HeldOutPrediction] = []
     with show_stages("calibrate mukca", as_json) as progress:
@@ -163,7 +169,7 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
             left.append(one)
         else:
             found = calibrate_sockets(robot, sockets, options)
-            names = held_out_names(sockets)
+            names = list_names_to_hold_out(sockets)
             for number, name in enumerate(names, start=1):
                 report(f"predict {name}, held out", number / (len(names) + 1))
                 left.append(predict_held_out_place(robot, sockets, name, options)[0])
@@ -200,7 +206,7 @@ def socket_document(
     alone = {name for name, told in status.items() if told == STATUS_FULL}
     parameters = [
         {
-            "name": name, "value": value, "unit": _unit(name, angular), "identifiability": status[name],
+            "name": name, "value": value, "unit": _parameter_unit(name, angular), "identifiability": status[name],
             "std": std if name in alone else None, "low": low if name in alone else None,
             "high": high if name in alone else None,
         }
@@ -221,12 +227,12 @@ def socket_document(
                 "nominal_rms_mm": 1e3 * calibration.nominal_errors.rms,
                 "rms_mm": 1e3 * calibration.calibrated_errors.rms,
                 "rms_without_outliers_mm": 1e3 * calibration.calibrated_errors.rms_without_outliers,
-                "socket_distance_mm": _millimetres(calibration.calibrated_errors.socket_distances),
+                "socket_distance_mm": _convert_to_millimetres(calibration.calibrated_errors.socket_distances),
             },
             "distance_mm": None if calibration.options.distance is None else 1e3 * calibration.options.distance,
             "noise_mm": 1e3 * calibration.noise,
             "model": calibration.model,
-            "model_errors_mm": _millimetres(calibration.model_errors),
+            "model_errors_mm": _convert_to_millimetres(calibration.model_errors),
             "expected_sizes": calibration.sizes,
             "parameters": parameters,
             "effective_parameters": len(calibration.fit.residual) - calibration.fit.degrees_of_freedom,
@@ -250,13 +256,13 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
         "rms_without_outliers_mm": rms_over_parts("calibrated", "rms_without_outliers"),
         "nominal_rms_mm": rms_over_parts("nominal", "rms"),
         "given_rms_mm": rms_over_parts("given", "rms"),
-        "socket_distance_mm": _millimetres(distances),
+        "socket_distance_mm": _convert_to_millimetres(distances),
         "parts": {
             one.name: {
                 "rms_mm": 1e3 * one.calibrated_errors.rms,
                 "rms_without_outliers_mm": 1e3 * one.calibrated_errors.rms_without_outliers,
                 "nominal_rms_mm": 1e3 * one.nominal_errors.rms,
-                "sockets_mm": _millimetres(one.calibrated_errors.rms_by_socket),
+                "sockets_mm": _convert_to_millimetres(one.calibrated_errors.rms_by_socket),
                 "model": one.model,
                 "outliers": _outlier_rows(one.calibrated_errors.outliers),
             }
@@ -265,7 +271,7 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
     }
 
 
-def _find_robot(
+def _load_or_choose_robot(
     data: Path, robot_option: str | None, sockets: Sequence[Socket], options: SocketOptions
 ) -> tuple[SerialRobot, list[str]]:
     """Load the robot of the option, else the file in the data folder, else the best shipped robot.
@@ -304,16 +310,16 @@ def _write(
     calibration: SocketCalibration,
     heldout_parts: Sequence[HeldOutPrediction],
 ) -> None:
-    from hydrotele.show.calibration_report import draw_sockets, write_robot_report
+    from hydrotele.show.calibration_report import draw_socket_errors, write_robot_report
 
     write_json(folder / "calibration.json", document)
     source = f"calibrated by hydrotele {hydrotele.__version__} from {document['data']}"
     (folder / "calibrated.yaml").write_text(robot_to_yaml(calibration.robot, source), encoding="utf-8")
     origin = Path(calibration.nominal.source)
     if origin.suffix == ".urdf":
-        made = correct_urdf(calibration.robot, read_text(origin))
+        made = write_origins_to_urdf(calibration.robot, read_text(origin))
         (folder / "calibrated.urdf").write_text(made, encoding="utf-8")
-    picture = draw_sockets(calibration, heldout_parts)
+    picture = draw_socket_errors(calibration, heldout_parts)
     (folder / "sockets.png").write_bytes(picture)
     write_robot_report(folder / "report.html", document, picture)
     summary = {
@@ -337,8 +343,8 @@ def _print(
         apart = ", ".join(f"{1e3 * d:.3f}" for d in one.calibrated_errors.socket_distances.values())
         rows.add_row(
             one.name,
-            _mm(one.nominal_errors),
-            f"[bold]{_mm(one.calibrated_errors)}[/]",
+            _format_rms_mm(one.nominal_errors),
+            f"[bold]{_format_rms_mm(one.calibrated_errors)}[/]",
             apart or "-",
         )
     if len(heldout_parts) > 1:
@@ -350,8 +356,8 @@ def _print(
     apart = ", ".join(f"{1e3 * d:.3f}" for d in calibration.calibrated_errors.socket_distances.values())
     rows.add_row(
         "(all data, fitted)",
-        _mm(calibration.nominal_errors),
-        _mm(calibration.calibrated_errors),
+        _format_rms_mm(calibration.nominal_errors),
+        _format_rms_mm(calibration.calibrated_errors),
         apart or "-",
     )
     stdout_console.print(rows)
@@ -391,17 +397,17 @@ def _print_combinations(document: dict[str, Any]) -> None:
     stdout_console.print("not identifiable: " + (", ".join(document["not_identifiable"]) or "none"))
 
 
-def _unit(name: str, angular: Sequence[str]) -> str:
+def _parameter_unit(name: str, angular: Sequence[str]) -> str:
     if name.startswith("sag."):
         return "rad s^2/m^2"
     return "rad" if name[0] in angular else "m"
 
 
-def _mm(judged: SocketErrors) -> str:
-    return f"{1e3 * judged.rms:.3f}"
+def _format_rms_mm(errors: SocketErrors) -> str:
+    return f"{1e3 * errors.rms:.3f}"
 
 
-def _millimetres(values: dict[str, float]) -> dict[str, float]:
+def _convert_to_millimetres(values: dict[str, float]) -> dict[str, float]:
     return {name: 1e3 * value for name, value in values.items()}
 
 
@@ -549,7 +555,7 @@ SEARCH_BOX_SIGMAS = 8.0  # half width of the search box, in expected sizes of th
 
 
 def calibrate_hybrid(
-    data: Path, robot: str | None, kind: str, parameters: str, evolution: bool, steps: int,
+    data: Path, robot: str | None, error_model: str, parameters: str, evolution: bool, mcmc_steps: int,
     seed: int, target: Path | None, as_json: bool,
 ) -> Calibration:  # fmt: skip
     """Calibrate a serial robot that carries a hexapod from measured poses; print and write the result.
@@ -557,10 +563,10 @@ def calibrate_hybrid(
     Args:
         data: folder with `poses.csv` or `poses.parquet`.
         robot: nominal robot, None for that of the folder, else `iwr`.
-        kind: error model: `dh` (Denavit-Hartenberg), `poe` (product of exponentials) or `auto`.
+        error_model: error model: `dh` (Denavit-Hartenberg), `poe` (product of exponentials) or `auto`.
         parameters: `all`, `document` (the 36 of Wang 2012) or names separated by commas.
         evolution: whether to search by differential evolution as well.
-        steps: number of MCMC steps, 0 for no MCMC.
+        mcmc_steps: number of MCMC steps, 0 for no MCMC.
         seed: random seed of differential evolution and MCMC.
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
@@ -571,27 +577,27 @@ def calibrate_hybrid(
     Raises:
         InputError: the folder, the robot or an option is not usable.
     """
-    if kind not in ("auto", "dh", "poe"):
-        raise InputError(f"--model {kind}", "valid: auto, dh, poe")
+    if error_model not in ("auto", "dh", "poe"):
+        raise InputError(f"--model {error_model}", "valid: auto, dh, poe")
     check_range("--seed", seed, 0, MAX_SEED, "random seed")
-    if steps:
-        check_range("--posterior", steps, MIN_STEPS, MAX_STEPS, "number of MCMC steps")
+    if mcmc_steps:
+        check_range("--posterior", mcmc_steps, MIN_STEPS, MAX_STEPS, "number of MCMC steps")
     if target:
         check_output_folder(target, KIND)
     nominal = load_hybrid(robot or find_robot_file(Path(data)) or "iwr")
     measurement, heldout = read_measurement(data, nominal)
-    names = _parameter_names(nominal, kind, parameters)
+    names = _parse_parameter_names(nominal, error_model, parameters)
     with show_stages("calibrate hybrid", as_json) as progress:
         report = progress or ignore_stage
         report("fit the robot", 0.0)
-        if kind == "auto":
+        if error_model == "auto":
             done = calibrate_best_model(nominal, measurement, names)
         else:
-            done = calibrate_hybrid_robot(nominal, measurement, "dh" if kind == "dh" else "poe", names)
+            done = calibrate_hybrid_robot(nominal, measurement, "dh" if error_model == "dh" else "poe", names)
         report("differential evolution", 0.3)
         evolved = _run_evolution(done, seed) if evolution else None
         report("MCMC", 0.6)
-        posterior = _run_mcmc(done, steps, seed) if steps else None
+        posterior = _run_mcmc(done, mcmc_steps, seed) if mcmc_steps else None
     result = _hybrid_document(data, done, heldout, evolved, posterior)
     if target:
         with atomic_folder(target, KIND) as folder:
@@ -605,7 +611,7 @@ def calibrate_hybrid(
     return done
 
 
-def _parameter_names(nominal: HybridRobot, kind: str, parameters: str) -> tuple[str, ...] | None:
+def _parse_parameter_names(nominal: HybridRobot, kind: str, parameters: str) -> tuple[str, ...] | None:
     if parameters == "all":
         return None
     model = build_error_model(nominal, "poe" if kind == "poe" or not nominal.specification.carriage else "dh")
@@ -617,7 +623,7 @@ def _parameter_names(nominal: HybridRobot, kind: str, parameters: str) -> tuple[
 
 
 def _run_evolution(calibration: Calibration, seed: int) -> EvolutionResult:
-    eq = fitted_equations(calibration)
+    eq = restrict_to_fitted_parameters(calibration)
     return minimize_by_evolution(
         eq.negative_log_likelihood,
         -SEARCH_BOX_SIGMAS * eq.scales,
@@ -627,7 +633,7 @@ def _run_evolution(calibration: Calibration, seed: int) -> EvolutionResult:
 
 
 def _run_mcmc(calibration: Calibration, steps: int, seed: int) -> Posterior:
-    eq, fit = fitted_equations(calibration), calibration.fit
+    eq, fit = restrict_to_fitted_parameters(calibration), calibration.fit
     free = ~fit.held
     noise = 1.0 if calibration.equations.measurement.noise_is_known else fit.noise
     return sample_posterior(
@@ -680,9 +686,9 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
             "generations": evolved.generations, "evaluations": evolved.evaluations,
             "converged": evolved.converged, "misfit": evolved.cost,
             "misfit_least_squares": float(
-                fitted_equations(calibration).negative_log_likelihood(fit.values[free][None])[0]),
+                restrict_to_fitted_parameters(calibration).negative_log_likelihood(fit.values[free][None])[0]),
             "max_difference_in_std": float(away.max()),
-            "values": dict(zip(fitted_equations(calibration).names, evolved.values.tolist(), strict=True)),
+            "values": dict(zip(restrict_to_fitted_parameters(calibration).names, evolved.values.tolist(), strict=True)),
         }  # fmt: skip
     if posterior is not None:
         away = np.abs(posterior.mean - fit.values[free]) / fit.standard_deviations[free]
@@ -792,9 +798,9 @@ def _print_hybrid(result: dict[str, Any]) -> None:
             )
 
 
-def simulate_hybrid(
+def simulate_hybrid_to_folder(
     target: Path, robot: str | None, poses: int, heldout: int, seed: int, noise: float,
-    errors: float, parameters: str, kind: str, choose: str = "random",
+    errors: float, parameters: str, error_model: str, choose: str = "random",
 ) -> None:  # fmt: skip
     """Simulate the measurement of a hexapod-carrying robot with manufacturing errors; write it to a folder.
 
@@ -809,13 +815,13 @@ def simulate_hybrid(
         noise: factor on the noise of all sensors.
         errors: factor on the manufacturing errors of 1 mm and 1 mrad.
         parameters: parameters with errors: `all`, `document` or names separated by commas.
-        kind: error model of the simulated errors: `auto`, `dh` or `poe`.
+        error_model: error model of the simulated errors: `auto`, `dh` or `poe`.
         choose: `random` poses, or a criterion of `select_informative_poses`.
 
     Raises:
         InputError: the folder cannot be written, or an option is not usable.
     """
-    from hydrotele.kinematics.hybrid import apply_errors
+    from hydrotele.kinematics.hybrid import apply_geometry_errors
     from hydrotele.simulate.hybrid import (
         default_wires,
         sample_manufacturing_errors,
@@ -832,12 +838,18 @@ def simulate_hybrid(
     check_range("--heldout", heldout, 0, MAX_POSES, "number of poses")
     check_output_folder(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
-    kind = "dh" if kind == "auto" and nominal.specification.carriage else "poe" if kind == "auto" else kind
-    names = _parameter_names(nominal, kind, parameters)
-    model = build_error_model(nominal, "dh" if kind == "dh" else "poe")
+    error_model = (
+        "dh"
+        if error_model == "auto" and nominal.specification.carriage
+        else "poe"
+        if error_model == "auto"
+        else error_model
+    )
+    names = _parse_parameter_names(nominal, error_model, parameters)
+    model = build_error_model(nominal, "dh" if error_model == "dh" else "poe")
     rng, wires = np.random.default_rng(seed), default_wires()
     planted = sample_manufacturing_errors(model, rng, names, errors)
-    true = apply_errors(model, planted)
+    true = apply_geometry_errors(model, planted)
     sizes = {key: noise * size for key, size in SENSOR_NOISE.items()}
     stated = sizes if noise > 0.0 else {}
     with atomic_folder(target, MEASUREMENT) as folder:
@@ -845,7 +857,7 @@ def simulate_hybrid(
             if count:
                 joints, legs = sample_poses(nominal, count, rng, wires)
                 if stem == POSES_STEM and choose != "random":
-                    joints, legs = _select_poses(model, wires, count, rng, choose)
+                    joints, legs = _sample_informative_poses(model, wires, count, rng, choose)
                 try:
                     read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
                 except (UnreachableError, NoIntersectionError) as error:
@@ -853,7 +865,7 @@ def simulate_hybrid(
                         f"--errors {errors:g} --noise {noise:g}", f"{error}: reduce the errors or the noise"
                     ) from None
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
-        (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
+        (folder / "measurement.yaml").write_text(format_measurement_yaml(nominal.name, wires, stated))
         save_hybrid(nominal, folder / "robot.yaml", "nominal robot")
         (folder / "truth").mkdir()
         save_hybrid(true, folder / "truth" / "robot.yaml", "the robot that was simulated")
@@ -864,7 +876,7 @@ def simulate_hybrid(
     stdout_console.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} held-out poses")
 
 
-def _select_poses(model, wires, count: int, rng: np.random.Generator, criterion: Any):
+def _sample_informative_poses(model, wires, count: int, rng: np.random.Generator, criterion: Any):
     """Return joint values and leg lengths of the `count` most informative of many random poses.
 
     `criterion` is the observability criterion to maximise: D or O1 to O5.

@@ -15,7 +15,7 @@ from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import LOG_SUFFIXES, MEASURED_STEM, find_logs
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
-from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, machine_path, shipped_machines
+from hydrotele.machine.machine_file import MACHINE_FILE, find_machine_file, load_machine, shipped_machines
 from hydrotele.simulate.mechanism import Mjcf
 
 _DESCRIPTIONS = ("description", "what")  # keys of the text that describes an item
@@ -41,7 +41,7 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
         "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows,
     }  # fmt: skip
     if item_kind is None and not as_json:
-        print(format_summary({kind: _item_names(kind) for kind in _KINDS}, stdout_console.width))
+        print(format_name_lists({kind: _item_names(kind) for kind in _KINDS}, stdout_console.width))
         return
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
@@ -54,7 +54,7 @@ _MAX_SUMMARY_LINES = 30  # a summary fits a terminal window
 _MIN_TEXT_WIDTH = 30  # characters next to the names; a narrower text starts below its name
 
 
-def format_summary(names: dict[str, list[str]], width: int) -> str:
+def format_name_lists(names: dict[str, list[str]], width: int) -> str:
     """Format the names of all items of all kinds in at most 30 lines, without cutting a name.
 
     Args:
@@ -97,7 +97,7 @@ def format_items(kind: str, rows: list[dict], width: int) -> str:
     for row in rows:
         head = f"  {row['name']}"
         keys = sorted(row.keys() - {"name"}, key=lambda key: (key not in _DESCRIPTIONS, list(row).index(key)))
-        texts = [_format_value(key, row[key]) for key in keys if row[key] not in ("", [], {})]
+        texts = [_format_item_property(key, row[key]) for key in keys if row[key] not in ("", [], {})]
         texts = [line for text in texts for line in _wrap_text(text, width - indent, "  ")]
         if texts and len(head) + 2 <= indent:
             head = head.ljust(indent) + texts.pop(0)
@@ -110,7 +110,7 @@ def _wrap_text(text: str, width: int, further_indent: str = "") -> list[str]:
     return wrap(text, max(width, 1), subsequent_indent=further_indent, break_long_words=False, break_on_hyphens=False)
 
 
-def _format_value(name: str, value) -> str:
+def _format_item_property(name: str, value) -> str:
     """Format a property of an item as `name: value`, or a description as it is.
 
     A dict is the parameters of an effect, {name: unit, low and high}.
@@ -139,7 +139,7 @@ def _item_names(kind: str) -> list[str]:
 def _machine_rows() -> list[dict]:
     rows = []
     for name in shipped_machines():
-        data, _ = read_yaml(machine_path(name))
+        data, _ = read_yaml(find_machine_file(name))
         tools = list(data.get("tools") or ["none"])
         axes = list(data.get("axes") or {})
         rows.append({"name": name, "axes": axes, "tools": tools, "description": data.get("description", "")})
@@ -321,10 +321,10 @@ def _check_logs(path: Path, log_machine: LogMachine, notes: list[str]) -> str:
 
     Notes on repairs are appended to `notes`.
     """
-    from hydrotele.cli.opening import name_machine, open_logs
+    from hydrotele.cli.opening import find_machine_and_tool_names, open_logs
     from hydrotele.logs.dataset import make_dataset, merge_runs_without_machine
 
-    if name_machine([path], log_machine.name)[0] is None:
+    if find_machine_and_tool_names([path], log_machine.name)[0] is None:
         logs, said = merge_runs_without_machine(path)
         notes += said
         checked = "; not checked against a machine: give --machine"
@@ -347,10 +347,10 @@ def _sweep_names() -> list[str]:
 
 
 def _check_sweep(path: Path) -> str:
-    from hydrotele.run.sweep_facts import check_points, load_sweep, open_base
+    from hydrotele.run.sweep_facts import check_points, load_sweep, read_base_scenario
 
     file = load_sweep(path)
-    check_points(open_base(file))
+    check_points(read_base_scenario(file))
     varied = ", ".join(file.sweep.varied_keys) or "seed"
     return f"{file.sweep.runs} runs of {file.sweep.scenario}, varied: {varied}"
 
@@ -396,9 +396,9 @@ def _check_machine(path: Path) -> str:
 
 
 def _check_scenario(scenario) -> str:
-    from hydrotele.run.run import prepare
+    from hydrotele.run.run import prepare_run
 
-    plan = prepare(scenario).plan
+    plan = prepare_run(scenario).plan
     notes_ = f"; {'; '.join(plan.notes)}" if plan.notes else ""
     return f"{scenario.duration:g} s of {scenario.machine}, {scenario.pilot.kind} pilot{notes_}"
 
@@ -423,9 +423,9 @@ def export_machine(name: str, tool: str | None, target: Path | None, picture: Pa
         return
     machine = load_machine(name, tool)
     if picture:
-        from hydrotele.show.picture import render_picture
+        from hydrotele.show.picture import render_machine
 
-        render_picture(machine, picture, camera=camera)
+        render_machine(machine, picture, camera=camera)
         stderr_console.print(f"written to {picture}")
         if target is None:
             return

@@ -22,7 +22,7 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
-from hydrotele.cli.opening import find_machine
+from hydrotele.cli.opening import load_machine_for_logs
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
@@ -41,7 +41,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 from hydrotele.simulate.native import stop_profiling_clock
 
 _MACHINE_SUBFOLDERS = (
@@ -84,7 +84,7 @@ class ModelComparison:
         columns = [column[~np.isnan(column)] for column in np.array(found).T]
         return np.array([column.mean() if len(column) else math.nan for column in columns])
 
-    def count_diverged(self, horizon: str) -> tuple[int, int]:
+    def count_diverged_predictions(self, horizon: str) -> tuple[int, int]:
         """Return how many predictions over a horizon diverged, and the number of all predictions."""
         found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
         return sum(h.diverged for h in found), sum(h.windows for h in found)
@@ -123,7 +123,7 @@ def compare_models(
     if target is not None:
         check_output_folder(target, "compare")
     stop_profiling_clock()
-    named = {name: find_machine(data, machine_folder(name), tool) for name in machines}
+    named = {name: load_machine_for_logs(data, find_machine_folder(name), tool) for name in machines}
     dataset = load_dataset(
         list(data), next(iter(named.values())), sensors, heldout, force=force
     )  # fmt: skip
@@ -134,10 +134,10 @@ def compare_models(
     with show_stages("compare", as_json) as progress:
         compared = _evaluate_models(named, baselines, dataset, judged, horizons, progress)
     shown = _available_horizons(compared)
-    document = compare_document(compared, shown, dataset, data)
+    document = build_comparison_document(compared, shown, dataset, data)
     if target is not None:
         with atomic_folder(target, "compare") as folder:
-            _write(folder, document, compared, dataset, judged[0], _plot_horizon(horizons, judged[0]))
+            _write(folder, document, compared, dataset, judged[0], _choose_plot_horizon(horizons, judged[0]))
     if as_json:
         print_json(document)
     else:
@@ -147,7 +147,7 @@ def compare_models(
     return document
 
 
-def machine_folder(name: str) -> str:
+def find_machine_folder(name: str) -> str:
     """Return the subfolder with the corrected machine of a result folder of `gap` or `identify`.
 
     Any other name or folder is returned unchanged.
@@ -158,7 +158,7 @@ def machine_folder(name: str) -> str:
     return name
 
 
-def compare_document(
+def build_comparison_document(
     comparisons: Sequence[ModelComparison],
     printed_horizons: Sequence[str],
     dataset: Dataset,
@@ -166,7 +166,7 @@ def compare_document(
 ) -> dict[str, Any]:
     """Return the comparison as JSON data: RMS errors in SI units, None if a model diverged."""
 
-    def by_channel(values: np.ndarray) -> dict[str, float]:
+    def map_channels_to_values(values: np.ndarray) -> dict[str, float]:
         return dict(zip(dataset.channels, values.tolist(), strict=True))
 
     models = []
@@ -174,20 +174,20 @@ def compare_document(
         runs = [
             {
                 "run": errors.run,
-                "one_step": by_channel(errors.one_step),
+                "one_step": map_channels_to_values(errors.one_step),
                 "horizons": {
                     name: {
                         "seconds": h.seconds, "windows": h.windows, "diverged": h.diverged,
-                        "rms": by_channel(h.rms), "final": by_channel(h.final),
-                        "median": by_channel(h.median),
+                        "rms": map_channels_to_values(h.rms), "final": map_channels_to_values(h.final),
+                        "median": map_channels_to_values(h.median),
                     }
                     for name, h in errors.horizons.items()
                 },
             }
             for errors in model.runs
         ]  # fmt: skip
-        mean = {name: by_channel(model.mean_errors(name)) for name in printed_horizons}
-        one_step = by_channel(model.mean_errors(_ONE_STEP))
+        mean = {name: map_channels_to_values(model.mean_errors(name)) for name in printed_horizons}
+        one_step = map_channels_to_values(model.mean_errors(_ONE_STEP))
         models.append(
             {"name": model.name, "kind": model.kind, "runs": runs,
              "mean": {"one_step": one_step, "horizons": mean}}
@@ -198,7 +198,7 @@ def compare_document(
             "data": [str(path) for path in data],
             "fitted_runs": [run.name for run in dataset.fit],
             "evaluated_runs": [errors.run for errors in comparisons[0].runs],
-            "units": {channel: default_unit(channel) for channel in dataset.channels},
+            "units": {channel: default_channel_unit(channel) for channel in dataset.channels},
             "models": models,
             "notes": list(dataset.notes),
         }
@@ -226,8 +226,8 @@ def _evaluate_models(
             runner = prepare(run)
             errors.append(free_run_errors(runner, run, horizons))
             if run is evaluated_runs[0]:
-                begin = _first_rows(run)
-                pictured = chained(runner, begin, _plot_horizon(horizons, run))
+                begin = _truncate_run_for_plot(run)
+                pictured = chained(runner, begin, _choose_plot_horizon(horizons, run))
         done += 1
         compared.append(ModelComparison(name, kind, tuple(errors), pictured))
     return compared
@@ -259,7 +259,7 @@ def _available_horizons(comparisons: Sequence[ModelComparison]) -> list[str]:
     return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
 
 
-def _plot_horizon(horizons: Sequence[float], run: RunData) -> float:
+def _choose_plot_horizon(horizons: Sequence[float], run: RunData) -> float:
     """Return the time after which the plotted prediction restarts from the measurements [s].
 
     It is the longest horizon that fits three times into the plot, else a third of the plot.
@@ -268,7 +268,7 @@ def _plot_horizon(horizons: Sequence[float], run: RunData) -> float:
     return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)
 
 
-def _first_rows(run: RunData) -> RunData:
+def _truncate_run_for_plot(run: RunData) -> RunData:
     rows = slice(0, round(_MAX_PLOT_SECONDS / run.period))
     return dataclasses.replace(
         run, command=run.command[rows], command_known=run.command_known[rows],
@@ -284,12 +284,12 @@ def _write(
 
     write_json(folder / "compare.json", document)
     stderr_console.print("drawing free_run.png ...", style="dim")
-    begin, some = _first_rows(run), slice(0, _MAX_PLOTS)
+    begin, some = _truncate_run_for_plot(run), slice(0, _MAX_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
     channels = dataset.channels[some]
     picture = draw_open_loop_predictions(
         time, begin.reading[:, some], {m.name: m.plotted_prediction[:, some] for m in comparisons}, channels,
-        [default_unit(channel) for channel in channels],
+        [default_channel_unit(channel) for channel in channels],
         f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s",
     )  # fmt: skip
     (folder / "free_run.png").write_bytes(picture)
@@ -316,7 +316,7 @@ def _print(
     for c, channel in enumerate(dataset.channels):
         errors = {h: [m.mean_errors(h)[c] for m in comparisons] for h in (_ONE_STEP, *printed_horizons)}
         finite = [e for row in errors.values() for e in row if math.isfinite(e)]
-        unit, factor = display_unit(default_unit(channel), max(finite, default=math.nan))
+        unit, factor = display_unit(default_channel_unit(channel), max(finite, default=math.nan))
         for horizon, row in errors.items():
             cells = [_format_error(m, horizon, e * factor) for m, e in zip(comparisons, row, strict=True)]
             best = min((e for e in row if math.isfinite(e)), default=math.nan)
@@ -350,6 +350,6 @@ def _format_error(model: ModelComparison, horizon: str, error: float) -> str:
     if math.isnan(error):
         return "-"
     if math.isinf(error):
-        gone, windows = model.count_diverged(horizon)
+        gone, windows = model.count_diverged_predictions(horizon)
         return f"diverged in {gone} of {windows}" if windows else "diverged"
     return f"{error:.3g}"

@@ -42,9 +42,9 @@ class Job(NamedTuple):
 
 
 def _compile_teleoperation() -> None:
-    from hydrotele.run.run import compile_ticks
+    from hydrotele.run.run import compile_tick_loop
 
-    compile_ticks()
+    compile_tick_loop()
 
 
 def _compile_runs() -> None:
@@ -109,7 +109,7 @@ def compile_all(processes: int | None = None) -> None:
     folder = cache_folder()
     if folder is None:
         raise InputError("cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder")
-    complete = folder / f"complete_{_digest()}"
+    complete = folder / f"complete_{_hash_sources_and_versions()}"
     if complete.exists():
         typer.echo("all functions are compiled already")
         return
@@ -129,7 +129,7 @@ def compile_all(processes: int | None = None) -> None:
                     del running[job]
                     finished, spent = finished + job.seconds, spent + time.monotonic() - start
                     if process.returncode:
-                        raise InputError(f"compilation of {job.name}", _last_line(process))
+                        raise InputError(f"compilation of {job.name}", _read_last_error_line(process))
             scale = spent / finished if finished else 1.0  # time relative to `Job.seconds`
             begun = sum(min((time.monotonic() - start) / scale, job.seconds)
                         for job, (start, _) in running.items())  # fmt: skip
@@ -148,7 +148,7 @@ def compile_all(processes: int | None = None) -> None:
     typer.echo(f"all functions are compiled ({time.monotonic() - began:.0f} s)")
 
 
-def _digest() -> str:
+def _hash_sources_and_versions() -> str:
     """Return a hash of all that determines the compiled code: Python, numba, processor and sources."""
     package = Path(hydrotele.__file__).parent
     text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
@@ -165,7 +165,7 @@ def _start(job: Job) -> subprocess.Popen:
     )  # fmt: skip
 
 
-def _last_line(process: subprocess.Popen) -> str:
+def _read_last_error_line(process: subprocess.Popen) -> str:
     assert process.stderr
     lines = process.stderr.read().decode(errors="replace").strip().splitlines()
     return lines[-1] if lines else f"exit status {process.returncode}"

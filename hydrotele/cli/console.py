@@ -107,20 +107,20 @@ def print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
     """
     begin, last, over = time.perf_counter(), ["starts"], threading.Event()
 
-    def beat() -> None:
+    def print_status_lines() -> None:
         pause = min(_FIRST_STATUS_TIME, _STATUS_PERIOD)
         while not over.wait(pause):
             pause = _STATUS_PERIOD
             line = f"{label}: {last[0]}, {time.perf_counter() - begin:.0f} s"
             stderr_console.print(line, markup=False, soft_wrap=True)
 
-    def tell(text: str) -> None:
+    def set_status(text: str) -> None:
         last[0] = text
 
-    thread = threading.Thread(target=beat, daemon=True)
+    thread = threading.Thread(target=print_status_lines, daemon=True)
     thread.start()
     try:
-        yield tell
+        yield set_status
     finally:
         over.set()
         thread.join()
@@ -220,13 +220,13 @@ def catch_first_interrupt() -> Iterator[Callable[[], bool]]:
     """
     seen: list[bool] = []
 
-    def note(number, frame) -> None:
+    def handle_interrupt(number, frame) -> None:
         if seen:
             raise KeyboardInterrupt
         seen.append(True)
 
     try:
-        before = signal.signal(signal.SIGINT, note)
+        before = signal.signal(signal.SIGINT, handle_interrupt)
     except ValueError:  # only the main thread can set signal handlers
         yield lambda: False
         return

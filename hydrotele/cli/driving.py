@@ -19,8 +19,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.haptics.timing import (
     RealTimePacer,
-    load_of_machine,
-    measure_idle_deadlines,
+    measure_missed_deadlines,
+    read_load_averages,
     read_steal_time,
     summarise_durations,
 )
@@ -32,9 +32,9 @@ from hydrotele.run.live import (
     Pacer,
     Status,
     TickCallback,
-    additional_axes,
+    axes_not_moved_by_joystick,
     drive_scenario,
-    haptic_address,
+    parse_haptic_address,
 )
 from hydrotele.run.run import Run, Session, load_simulated_machine
 from hydrotele.scenario.scenario import Scenario, load_scenario
@@ -107,7 +107,7 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
 
     Args:
         options: options of the command.
-        idle_test: deadlines missed by an idle loop on this computer, from `measure_idle_deadlines`.
+        idle_test: deadlines missed by an idle loop on this computer, from `measure_missed_deadlines`.
 
     Returns:
         The output folder.
@@ -116,9 +116,9 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
     target = options.target or Path("runs", scenario.name)
     check_output_folder(target, "run")
     machine = load_simulated_machine(scenario)
-    further = tuple(additional_axes(machine))
+    further = tuple(axes_not_moved_by_joystick(machine))
     if _is_haptic_device(options):
-        device = HapticHandle(*haptic_address(options.device), len(further))
+        device = HapticHandle(*parse_haptic_address(options.device), len(further))
         pacer = RealTimePacer(scenario.tick_count, _MACHINE_PRIORITY)
     else:
         device, pacer = open_device(options.device, further), Pacer(options.speed)
@@ -136,7 +136,7 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
         machine_side = {
             "control_rate": scenario.control_rate, "ticks": pacer.ticks, "missed": pacer.missed,
             "lateness": summarise_durations(pacer.delays()), "priority": pacer.priority,
-            "load": load_of_machine(),
+            "load": read_load_averages(),
         }  # fmt: skip
         result.summary["haptic"] = {
             "machine": machine_side, "channel": result.summary["haptic"],
@@ -193,7 +193,7 @@ def _run_idle_test(duration: float) -> dict[str, Any]:
     """
     seconds = min(_IDLE_TEST_LIMITS[1], max(_IDLE_TEST_LIMITS[0], duration / 3.0))
     stderr_console.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
-    return measure_idle_deadlines(seconds, HAPTIC_CONTROL_RATE, _MACHINE_PRIORITY)
+    return measure_missed_deadlines(seconds, HAPTIC_CONTROL_RATE, _MACHINE_PRIORITY)
 
 
 def _is_haptic_device(options: DriveOptions) -> bool:
@@ -232,13 +232,13 @@ def _load_drive_scenario(options: DriveOptions) -> Scenario:
     if _is_haptic_device(options):
         overrides = {"control_rate": repr(HAPTIC_CONTROL_RATE)} | overrides
     scenario = load_scenario(name, overrides)
-    if options.scenario is None and "pilot.force" not in overrides and _passive_joints(scenario):
+    if options.scenario is None and "pilot.force" not in overrides and _find_undetermined_joints(scenario):
         overrides |= {"pilot.force": '"true"', "sensors": "ideal"}
         scenario = load_scenario(name, overrides)
     return scenario
 
 
-def _passive_joints(scenario: Scenario) -> list[str]:
+def _find_undetermined_joints(scenario: Scenario) -> list[str]:
     """Return the joints that neither a drive nor a closed kinematic loop determines.
 
     With such joints, the force at the tip cannot be computed from the pressures.
@@ -275,7 +275,7 @@ def _show_progress(options: DriveOptions, device: Device, interrupted: Callable[
     window: list[Window] = []
     due = [0.0, 0.0]
 
-    def watch(session: Session, status: Callable[[], Status], now: float) -> bool:
+    def update_display(session: Session, status: Callable[[], Status], now: float) -> bool:
         if interrupted():
             return False
         if options.viewer and now >= due[0]:
@@ -287,15 +287,15 @@ def _show_progress(options: DriveOptions, device: Device, interrupted: Callable[
                 return False
         if lines and now >= due[1]:
             due[1] = now + 1.0 / _STATUS_LINE_RATE
-            stderr_console.print(_line(status()), end="\r", overflow="crop", no_wrap=True, style="dim")
+            stderr_console.print(_format_status_line(status()), end="\r", overflow="crop", no_wrap=True, style="dim")
         return True
 
     try:
-        yield watch
+        yield update_display
     finally:
         for opened in window:
             opened.close()
 
 
-def _line(status: Status) -> str:
+def _format_status_line(status: Status) -> str:
     return "  ".join(f"{name} {value}" for name, value in status.rows())

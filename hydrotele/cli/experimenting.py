@@ -26,7 +26,7 @@ PUBLICATIONS = ("abdellatif2008", "khoshzaban1992", "wang2012", "zhu1994")
 _COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
 
 
-def load_series(name: str) -> Series:
+def load_experiment_series(name: str) -> Series:
     """Import the experiments and claims of a publication by its name, such as `zhu1994`.
 
     Raises:
@@ -57,7 +57,7 @@ def experiments_to_folder(
     Raises:
         InputError: there is no publication of this name, or the target is not usable.
     """
-    series = load_series(name)
+    series = load_experiment_series(name)
     seeds = seeds or series.repetitions
     target = target or (None if as_json else Path("runs") / name)
     if target:

@@ -23,7 +23,7 @@ from hydrotele.cli.console import (
     stdout_console,
     write_json,
 )
-from hydrotele.cli.opening import find_machine, name_of_data
+from hydrotele.cli.opening import derive_data_name, load_machine_for_logs
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
@@ -80,10 +80,10 @@ def gap_to_folder(
     for name in effects:
         if name not in EFFECTS:
             raise InputError(f"--effect {name}", f"is not known; {suggest_valid_name(name, EFFECTS)}")
-    target = target or Path(f"gap_{name_of_data(data)}")
+    target = target or Path(f"gap_{derive_data_name(data)}")
     check_output_folder(target, "gap")
     stop_profiling_clock()
-    model = find_machine(data, machine, tool)
+    model = load_machine_for_logs(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
     gap = _run_search(dataset, effects, jobs, quiet=as_json)
     with atomic_folder(target, "gap") as folder:
@@ -165,7 +165,7 @@ def gap_mjcf_to_folder(
     from hydrotele.gap.patched import COLUMNS_FILE, write_mechanism
     from hydrotele.show.gap_report import write_report
 
-    target = target or Path(f"gap_{name_of_data(data)}")
+    target = target or Path(f"gap_{derive_data_name(data)}")
     check_output_folder(target, "gap")
     mechanism = load_mechanism(mjcf, columns)
     fit, judge, said = load_mechanism_records(data, mechanism, heldout, keep_measured_joints=True)
@@ -174,7 +174,7 @@ def gap_mjcf_to_folder(
         if progress:
             progress("simulate the models with the measured forces", 0.95)
         try:
-            gap = dataclasses.replace(gap, open_loop=simulate_open_loop(gap, data, mechanism, heldout))
+            gap = dataclasses.replace(gap, open_loop=compute_open_loop_errors(gap, data, mechanism, heldout))
         except InputError as error:
             note = f"No open-loop prediction: {error}."
             gap = dataclasses.replace(gap, notes=(*gap.notes, note))
@@ -231,7 +231,7 @@ def find_mechanism_files(
 _OPEN_LOOP_HORIZON = 0.25  # s; short, because an unstable mechanism diverges without control
 
 
-def simulate_open_loop(
+def compute_open_loop_errors(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
     """Compute position errors of open-loop simulations of the given and the corrected model.

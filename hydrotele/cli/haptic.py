@@ -17,7 +17,7 @@ from hydrotele.cli.console import (
     stdout_console,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.server import open_haptic_device, print_address, run_server
+from hydrotele.haptics.server import open_haptic_device, print_address, run_device_server
 
 MAX_MISSED_FRACTION = 1e-3  # maximum fraction of missed deadlines [1]
 _START_TIMEOUT = 60.0  # s, timeout for the start of the simulated device
@@ -73,7 +73,7 @@ def serve_device(options: HapticOptions) -> None:
 
     try:
         with catch_first_interrupt() as interrupted:
-            seen = run_server(
+            seen = run_device_server(
                 device, (options.host, options.port), period,
                 lambda: interrupted() or ended.is_set() or clock.monotonic() > end, announce_address,
             )  # fmt: skip
@@ -173,11 +173,11 @@ def print_latency(figures: dict) -> None:
         f"real-time priority: machine {machine['priority']}, channel {line['priority']}; load"
         f" average of the computer: {load[0] if load else 'unknown'}"
     )
-    for sentence in describe_computer(machine, computer):
+    for sentence in describe_computer_timing(machine, computer):
         stdout_console.print(sentence)
 
 
-def describe_computer(machine: dict, computer: dict) -> list[str]:
+def describe_computer_timing(machine: dict, computer: dict) -> list[str]:
     """Describe the processor time taken by the host, and whether computer or program missed deadlines.
 
     Args:

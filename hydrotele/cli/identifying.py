@@ -25,12 +25,12 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
-from hydrotele.cli.opening import find_machine, name_of_data
+from hydrotele.cli.opening import derive_data_name, load_machine_for_logs
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.excitation import MachineLimits, design_motion, select_informative_base
+from hydrotele.identify.excitation import MachineLimits, design_motion, select_determinable_parameters
 from hydrotele.identify.hydraulic import HydraulicIdentification, identify_hydraulics
 from hydrotele.identify.identification import identify_with_friction_shapes
 from hydrotele.identify.identified_machine import (
@@ -47,7 +47,7 @@ from hydrotele.identify.result import (
     count_statuses,
     parameter_rows,
 )
-from hydrotele.identify.setup import DynamicModel, cylinder_bars, machine_setup
+from hydrotele.identify.setup import DynamicModel, machine_setup, map_cylinder_bodies
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
@@ -127,10 +127,10 @@ def identify_to_folder(
         InputError: data, machine or target are not usable.
         typer.Exit: status 1 if the identified model predicts no held-out force better than zero force does.
     """
-    target = target or Path(f"identify_{name_of_data(data)}")
+    target = target or Path(f"identify_{derive_data_name(data)}")
     check_output_folder(target, "identify")
     stop_profiling_clock()
-    model = find_machine(data, machine, tool)
+    model = load_machine_for_logs(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force)
     with show_stages(f"identify {model.name}", as_json) as progress:
         say = progress or (lambda said, share: None)
@@ -179,7 +179,7 @@ def identify_mjcf_to_folder(
     """
     from hydrotele.show.identify_report import ReportSource, write_identify_report
 
-    target = target or Path(f"identify_{name_of_data(data)}")
+    target = target or Path(f"identify_{derive_data_name(data)}")
     check_output_folder(target, "identify")
     mechanism = load_mechanism(mjcf, columns)
     name = mechanism.setup.chain.name
@@ -233,7 +233,7 @@ def identify_mechanism(dataset: Dataset, choices: IdentificationOptions) -> Mech
     found = identify_with_friction_shapes(
         fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
-    patched, best = build_identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
+    patched, best = build_identified_machine(dataset.machine, found, map_cylinder_bodies(dataset.machine))
     return MechanismIdentification(found, best, patched)
 
 
@@ -375,7 +375,7 @@ def design_excitation_file(
     place = machine if machine in shipped_machines() else str(resolve_path(machine))
     setup = machine_setup(model, load_closed_chain(model))
     noise = np.maximum(compute_force_noise(model, named), 1e-9)
-    base = select_informative_base(model, setup, noise, period, seed)
+    base = select_determinable_parameters(model, setup, noise, period, seed)
     with show_stages(f"excite {model.name}", as_json) as progress:
         found = design_motion(
             MachineLimits(model, setup), setup, noise, base, period=period, harmonics=harmonics,

@@ -21,10 +21,10 @@ from hydrotele.cli.option_values import (
     CommandGroup,
     QuietOption,
     machine_overrides,
-    parse_numbers,
     parse_overrides,
+    parse_positive_numbers,
 )
-from hydrotele.cli.overview import DESCRIPTION, format_overview
+from hydrotele.cli.overview import DESCRIPTION, format_program_help
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
 
@@ -93,7 +93,7 @@ def compare(
     from hydrotele.cli.comparing import compare_models
 
     compare_models(
-        machine, data, tool, heldout, sensors, parse_numbers("--horizons", horizons), baseline or [],
+        machine, data, tool, heldout, sensors, parse_positive_numbers("--horizons", horizons), baseline or [],
         every, out, json, force,
     )  # fmt: skip
 
@@ -209,7 +209,7 @@ class OverviewGroup(NumberCheckingGroup):
 
     def format_help(self, ctx, formatter) -> None:
         """Print the overview of all commands."""
-        typer.echo(format_overview())
+        typer.echo(format_program_help())
 
 
 app = CommandGroup(
@@ -496,11 +496,11 @@ def analyse_teleop(
     json: JsonOption = False,
 ) -> None:
     """Analyse a teleoperator as a two-port: transparency, passivity, stability, delay margins."""
-    from hydrotele.cli.analysing import RobustnessOptions, analyse_any_to_folder
+    from hydrotele.cli.analysing import RobustnessOptions, analyse_case_or_scenario_to_folder
 
     pairs = parse_overrides(set_ or [])
     how = RobustnessOptions(period, delays, operators) if robust or delays else None
-    analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json, how)
+    analyse_case_or_scenario_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json, how)
 
 
 @app.command(
@@ -670,7 +670,7 @@ def demo(
 
 
 @app.callback(invoke_without_command=True)
-def _options(
+def _handle_global_options(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -689,25 +689,25 @@ def main() -> None:
     os.environ["PYTHONSAFEPATH"] = "1"  # child processes import nothing from the working folder
     ended: list[int] = []
 
-    def end(number: int, _: object) -> None:
+    def exit_on_sigterm(number: int, _: object) -> None:
         ended.append(128 + number)
         sys.exit(ended[0])  # SystemExit runs the cleanup code
 
-    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, exit_on_sigterm)
     for stream in (sys.stdout, sys.stderr):  # file names may be no valid text
         if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning {message}", err=True)
     try:
-        _run()
+        _run_app_and_report_errors()
     finally:
         if ended:  # a library may have replaced SystemExit by another exception
             sys.exit(ended[0])
 
 
-def _run() -> None:
+def _run_app_and_report_errors() -> None:
     try:
-        _check_arguments(sys.argv[1:])
+        _check_utf8_arguments(sys.argv[1:])
         app()
     except (Exception, SystemExit) as error:
         if type(error).__name__ == "SimulationFailed":
@@ -732,7 +732,7 @@ def _find_input_error(error: BaseException) -> InputError | None:
     return None
 
 
-def _check_arguments(words: list[str]) -> None:
+def _check_utf8_arguments(words: list[str]) -> None:
     """Raise InputError for arguments that are not valid UTF-8, whose bytes Python keeps as surrogates."""
     for word in words:
         if any("\ud800" <= character <= "\udfff" for character in word):

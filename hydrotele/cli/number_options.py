@@ -24,22 +24,22 @@ class NumberCheckingGroup(TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return a command that accepts only finite numbers."""
         command = super().get_command(ctx, cmd_name)
-        for each in _commands_below(command):
-            each.invoke = functools.partial(_invoke_checked, each, each.invoke)
+        for each in _iterate_leaf_commands(command):
+            each.invoke = functools.partial(_invoke_with_finite_numbers, each, each.invoke)
         return command
 
 
-def _commands_below(command: Any) -> Iterator[Any]:
+def _iterate_leaf_commands(command: Any) -> Iterator[Any]:
     """Yield a command or, for a group, its commands and those of its subgroups."""
     below = getattr(command, "commands", None)
     if below is None:
         yield from () if command is None else (command,)
     else:
         for each in below.values():
-            yield from _commands_below(each)
+            yield from _iterate_leaf_commands(each)
 
 
-def _invoke_checked(command: Any, invoke: Any, ctx: Any) -> Any:
+def _invoke_with_finite_numbers(command: Any, invoke: Any, ctx: Any) -> Any:
     """Run a command after checking that its numbers are finite."""
     for parameter in command.params:
         value = ctx.params.get(parameter.name)

@@ -56,12 +56,12 @@ def open_logs(
     Raises:
         InputError: a log is not usable, or its machine is not known.
     """
-    found = find_machine(paths, machine, tool)
+    found = load_machine_for_logs(paths, machine, tool)
     runs = read_runs(paths, found, found.log_columns, force, keep_truth=True)
     return OpenedLogs(found, runs, merge_runs(runs, found))
 
 
-def open_log(path: Path, machine: str | None = None, tool: str | None = None, force: bool = False) -> OpenedLogs:
+def open_single_log(path: Path, machine: str | None = None, tool: str | None = None, force: bool = False) -> OpenedLogs:
     """Load the log of a path that contains exactly one, and its machine, and check them.
 
     Args:
@@ -102,13 +102,13 @@ def find_recording(path: Path) -> Path | None:
     return found[0] if found else None
 
 
-def name_of_data(data: Sequence[Path]) -> str:
+def derive_data_name(data: Sequence[Path]) -> str:
     """Return a name for outputs: that of the first data folder, or of the folder of the first file."""
     first = resolve_path(data[0])
     return first.name if first.is_dir() else first.parent.name or first.stem
 
 
-def name_machine(data: Sequence[Path], name: str | None) -> tuple[str | None, str | None]:
+def find_machine_and_tool_names(data: Sequence[Path], name: str | None) -> tuple[str | None, str | None]:
     """Return the names of machine and tool of logs, None if unknown.
 
     The machine is `name`, else the file `machine.yaml` next to the first log, else that of the log's
@@ -124,7 +124,7 @@ def name_machine(data: Sequence[Path], name: str | None) -> tuple[str | None, st
     return name or None, metadata.get("tool")
 
 
-def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
+def load_machine_for_logs(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
     """Load the machine of logs, with the given tool or else that of the logs.
 
     The machine is `name`, else the file `machine.yaml` next to the first log, else that of the log's
@@ -135,7 +135,7 @@ def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Ma
     """
     if not data:
         raise InputError("the data", "no path was given: give log files or a folder with logs")
-    name, logged = name_machine(data, name)
+    name, logged = find_machine_and_tool_names(data, name)
     if not name:
         raise InputError(data[0], "its metadata does not name a machine: give --machine")
     found = load_machine(name, tool)

@@ -44,13 +44,13 @@ def identify_operator(
     from hydrotele.teleop.operator_identification import (
         format_operator_file,
         identify_operator,
-        read_tracking,
+        read_tracking_record,
     )
 
     if out:
         check_output_folder(out, _KIND)
     given = {"time": time, "target": target, "response": response, "hand": hand}
-    record, said = read_tracking(file, {key: name for key, name in given.items() if name})
+    record, said = read_tracking_record(file, {key: name for key, name in given.items() if name})
     fit = identify_operator(record, equalisation, source=str(file))
     fit = fit._replace(notes=(*said, *fit.notes))
     document = to_json_types({

@@ -45,13 +45,13 @@ def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
     return pairs
 
 
-def parse_numbers(option: str, text: str) -> list[float]:
+def parse_positive_numbers(option: str, text: str) -> list[float]:
     """Parse an option value that consists of positive numbers separated by commas.
 
     Raises:
         InputError: the text is empty or contains something other than positive numbers.
 
-    >>> parse_numbers("--horizons", "1, 5,30")
+    >>> parse_positive_numbers("--horizons", "1, 5,30")
     [1.0, 5.0, 30.0]
     """
     try:
@@ -93,15 +93,15 @@ class CommandGroup(typer.Typer):
 
         def register_with_quiet(function: Callable) -> Callable:
             @functools.wraps(function)
-            def run(quiet: bool, **values: Any) -> Any:
+            def call_without_quiet(quiet: bool, **values: Any) -> Any:
                 return function(**values)
 
             own = inspect.signature(function).parameters.values()
             own = [parameter.replace(annotation=_escape_help(parameter.annotation)) for parameter in own]
             added = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=QuietOption)
-            run.__dict__["__signature__"] = inspect.Signature([*own, added])
-            run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, added)}
-            register(run)
+            call_without_quiet.__dict__["__signature__"] = inspect.Signature([*own, added])
+            call_without_quiet.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, added)}
+            register(call_without_quiet)
             return function
 
         return register_with_quiet

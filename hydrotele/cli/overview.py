@@ -54,7 +54,7 @@ COMMANDS = {name: text for group in COMMAND_GROUPS.values() for name, text in gr
 """Summary of each command."""
 
 
-def format_overview(width: int | None = None) -> str:
+def format_program_help(width: int | None = None) -> str:
     """Format the output of `hydrotele --help`: usage, options, and a summary of each command.
 
     Args:

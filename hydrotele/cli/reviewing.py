@@ -21,11 +21,11 @@ from hydrotele.cli.console import (
     stdout_console,
     write_json,
 )
-from hydrotele.cli.opening import OpenedLogs, find_recording, find_run_log, open_log, open_logs
+from hydrotele.cli.opening import OpenedLogs, find_recording, find_run_log, open_logs, open_single_log
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.dataset import make_complete_logs
-from hydrotele.logs.files import align_origins, check_commands
+from hydrotele.logs.files import align_time_origins, check_commands
 from hydrotele.logs.log import Log, find_log_in_folder, save_log
 from hydrotele.machine.machine import Machine
 from hydrotele.run.replay import Replay, replay_log
@@ -79,7 +79,7 @@ def review_logs(
         with announce_output("plot", plot):
             _plot(first, second, machine, tool, plot, force)
     if video:
-        _film(first, second, machine, tool, video, force)
+        _write_video_of_log(first, second, machine, tool, video, force)
     if (plot or video) and not (recording or screenshot or port is not None):
         return
     with contextlib.ExitStack() as stack:
@@ -114,18 +114,18 @@ def _show(made: Path, outputs: ReviewOutputs) -> None:
             raise InputError("review", message)
 
 
-def _film(first, second, machine, tool, path: Path, force: bool) -> None:
+def _write_video_of_log(first, second, machine, tool, path: Path, force: bool) -> None:
     from hydrotele.show.video import write_video
 
     if second is not None:
         raise InputError("--video", "shows one log: omit the second log")
-    found, log = _open_log(find_run_log(first, _most_complete_log(first)), machine, tool, force)
+    found, log = _open_log(find_run_log(first, _choose_log_name(first)), machine, tool, force)
     with show_simulation_progress(f"video {path.name}") as progress:
         write_video(found, log, path, progress=progress)
     stdout_console.print(f"written to [bold]{path}[/]", soft_wrap=True)
 
 
-def _most_complete_log(path: Path) -> str:
+def _choose_log_name(path: Path) -> str:
     """Return `truth` if the run folder has a log of true states, with all joints and objects; else `measured`."""
     return "truth" if find_log_in_folder(path, "truth") else "measured"
 
@@ -145,7 +145,7 @@ def _record(first, second, machine, tool, path: Path, force: bool) -> None:
     from hydrotele.show.recording import write_recording
 
     if second is None:
-        which = _most_complete_log(first)
+        which = _choose_log_name(first)
         entries = {which: _open_log(find_run_log(first, which), machine, tool, force)}
     else:
         entries = _open_log_pair(first, second, machine, tool, force)
@@ -161,7 +161,7 @@ def _open_log(path: Path, machine: str | None, tool: str | None, force: bool) ->
     if path.suffix.lower() == ".rrd":
         message = "is a recording, not a log: give it alone, without --plot, --video, --out, --machine and --tool"
         raise InputError(path, message)
-    opened = open_log(path, machine, tool, force)
+    opened = open_single_log(path, machine, tool, force)
     print_notes(opened.notes)
     (log,) = opened.logs
     positions = [f"{opened.machine.position_kind(axis)}.{axis}" for axis in opened.machine.axes]
@@ -181,7 +181,7 @@ def _open_log_pair(first, second, machine, tool, force: bool) -> dict[str, tuple
         InputError: the logs belong to different machines.
     """
     logs = [_open_log(path, machine, tool, force) for path in (first, second)]
-    aligned = align_origins([log for _, log in logs])
+    aligned = align_time_origins([log for _, log in logs])
     logs = [(found, log) for (found, _), log in zip(logs, aligned, strict=True)]
     kinds = [found.name for found, _ in logs]
     if kinds[0] != kinds[1]:
@@ -244,12 +244,12 @@ def replay_logs(
                 prefix = f"{number}_" if len(results) > 1 else ""
                 name = prefix + result.measured.name
                 with announce_output(f"plot and recording of {result.measured.name}", None, quiet=as_json):
-                    _write(folder, name, the_machine, result)
-            data = {"kind": "replay", "replays": [replay_document(result) for _, result in results]}
+                    _write_replay_files(folder, name, the_machine, result)
+            data = {"kind": "replay", "replays": [replay_to_dict(result) for _, result in results]}
             write_json(folder / "summary.json", data)
         stderr_console.print(f"written to {target}")
     if as_json:
-        data = [replay_document(result) for _, result in results]
+        data = [replay_to_dict(result) for _, result in results]
         print_json(data[0] if len(data) == 1 else data)
 
 
@@ -268,7 +268,7 @@ def _replayable_logs(opened: OpenedLogs) -> list[Log]:
     return [log for log in logs if len(log) >= _MIN_REPLAY_ROWS]
 
 
-def replay_document(result: Replay) -> dict:
+def replay_to_dict(result: Replay) -> dict:
     """Return the prediction errors of a replay as JSON data: log, machine, errors of each channel."""
     return {
         "log": result.measured.source,
@@ -289,7 +289,7 @@ def _print(source: str, result: Replay) -> None:
     stdout_console.print(rows)
 
 
-def _write(folder: Path, name: str, machine, result: Replay) -> None:
+def _write_replay_files(folder: Path, name: str, machine, result: Replay) -> None:
     from hydrotele.show.overlay import plot_overlay
     from hydrotele.show.recording import write_recording
 

@@ -31,7 +31,7 @@ from hydrotele.run.sweep import (
     Progress,
     SweepResult,
     SweepSettings,
-    choose_figures,
+    choose_plotted_numbers,
     compute_statistics,
     run_sweep,
 )
@@ -202,7 +202,7 @@ def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> No
         typer.echo(message, err=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
-    figures = list(file.sweep.figures) or choose_figures(swept.table)
+    figures = list(file.sweep.figures) or choose_plotted_numbers(swept.table)
     study = _sweep_study(file, swept, figures)
     if not options.json:
         stderr_console.print("writing report.html ...", style="dim")
@@ -230,7 +230,7 @@ def _print_sweep(file: SweepFile, target: Path, swept: SweepResult, figures: lis
         print_json({
             "kind": "sweep", "name": file.name, "folder": str(target), "runs": file.sweep.runs,
             "runs_done": swept.n_executed, "failed": len(swept.failed),
-            "failures": [{"run": e.run, "reason": e.reason, **_values(swept, e)}
+            "failures": [{"run": e.run, "reason": e.reason, **_varied_values_of_run(swept, e)}
                          for e in swept.failed],
             "figures": found,
         })  # fmt: skip
@@ -248,7 +248,9 @@ def _print_sweep(file: SweepFile, target: Path, swept: SweepResult, figures: lis
     if swept.failed:
         stdout_console.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
     for entry in swept.failed[:_MAX_LISTED_FAILURES]:
-        varied = ", ".join(f"{key} {_format_value(value)}" for key, value in _values(swept, entry).items())
+        varied = ", ".join(
+            f"{key} {_format_value(value)}" for key, value in _varied_values_of_run(swept, entry).items()
+        )
         said = f"  run {entry.run} ({varied}): {entry.reason}"
         stdout_console.print(said, markup=False, soft_wrap=True)
     if len(swept.failed) > _MAX_LISTED_FAILURES:
@@ -258,7 +260,7 @@ def _print_sweep(file: SweepFile, target: Path, swept: SweepResult, figures: lis
     stdout_console.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
 
 
-def _values(swept: SweepResult, entry: JournalEntry) -> dict[str, Any]:
+def _varied_values_of_run(swept: SweepResult, entry: JournalEntry) -> dict[str, Any]:
     columns = swept.table.columns
     return {key: columns[key][entry.run - 1] for key in (*swept.table.varied_keys, "seed")}
 

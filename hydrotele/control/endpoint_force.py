@@ -25,31 +25,31 @@ from hydrotele.control.state_filter import (
     SECOND_DERIVATIVE,
     VALUE,
     filter_delay,
+    filter_noise_gains,
     filter_signal,
     filter_step,
-    filter_table,
-    noise_gains,
+    filter_step_matrix,
 )
 from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.control.tip_balance import (
     arm_joints,
     arm_record,
+    compute_dynamic_external_forces,
+    compute_static_external_forces,
     create_arm_balance,
-    dynamic_balance,
     gravity_parameter_count,
     independent_axes,
+    joint_gravity_torque,
     read_arm_record,
     solve_tip_force,
-    static_balance,
-    static_torque,
 )
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorSet, noise_rms
+from hydrotele.machine.machine import Machine, SensorSet, reading_noise_rms
 
 _GRAVITY_NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
 _POSES_PER_JOINT = 9  # poses per joint at which the static model is fitted to the masses
@@ -99,7 +99,7 @@ def gravity_regressor(q: np.ndarray) -> np.ndarray:
     """
     joint, size = np.arange(len(q)), gravity_parameter_count(len(q))
     units = np.eye(size)
-    return np.array([[static_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))])
+    return np.array([[joint_gravity_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))])
 
 
 def fit_gravity_to_masses(machine: Machine) -> GravityModel:
@@ -144,7 +144,7 @@ def _gravity_torques(arm, poses, torque):
     for row in range(len(poses)):
         for i in range(len(arm.joint)):
             arm.z[arm.joint[i]] = poses[row, i]
-        dynamic_balance(arm, outside)
+        compute_dynamic_external_forces(arm, outside)
         for i in range(len(arm.joint)):
             torque[row, i] = outside[arm.joint[i]]
 
@@ -184,12 +184,12 @@ def extract_slow_motion(machine: Machine, log: Log, period: float = EQUATION_PER
     independent_axes(machine, f"torques of {machine.name}")
     driver = {axis.joint: name for name, axis in machine.axes.items()}
     table, every = (
-        filter_table(_SLOW_MOTION_BANDWIDTH_HZ, 1.0 / log.rate),
+        filter_step_matrix(_SLOW_MOTION_BANDWIDTH_HZ, 1.0 / log.rate),
         max(1, round(period * log.rate)),
     )
     columns = []
     for name in (driver[joint] for joint in arm_joints(machine)):
-        head, rod = machine.axes[name].hydraulic_drive.areas
+        head, rod = machine.axes[name].hydraulic_drive.effective_areas
         force = head * log[f"pressure_head.{name}"] - rod * log[f"pressure_rod.{name}"]
         moved, pushed = (filter_signal(table, x)[::every] for x in (log[f"angle.{name}"], force))
         lever = axis_linkage(machine, name).rate(moved[:, VALUE])
@@ -278,16 +278,16 @@ def _solve_recursively(
     return found, history
 
 
-def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return for each instant (r,) whether a residual `left` (r, m - 1) is an outlier (Chauvenet's criterion).
+def _are_outliers(residuals: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Return for each instant (r,) whether a residual `residuals` (r, m - 1) is an outlier (Chauvenet's criterion).
 
     The scale of the residuals is that of the instants that are `kept` (r,).
     """
     from scipy.special import ndtri  # imported here, because runs do not need it
 
-    scale = np.median(np.abs(left[kept]), axis=0) / ndtri(0.75)
+    scale = np.median(np.abs(residuals[kept]), axis=0) / ndtri(0.75)
     most = -ndtri(0.25 / np.count_nonzero(kept))
-    return np.asarray((np.abs(left) > most * scale).any(axis=1))
+    return np.asarray((np.abs(residuals) > most * scale).any(axis=1))
 
 
 STATUS_WAITING, STATUS_GOOD, STATUS_BAD, STATUS_SINGULAR = range(4)
@@ -320,7 +320,7 @@ class DriveReadings(NamedTuple):
     still: np.ndarray
 
 
-@allocation_free
+@compile_without_allocation
 def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     """Filter new sensor readings and estimate the force of the environment on the arm's tip.
 
@@ -361,9 +361,9 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
             arm.z[n + c] = r.state[c, RATE]
             arm.acceleration[c] = r.state[c, SECOND_DERIVATIVE]
     if dynamic:
-        dynamic_balance(arm, r.outside)
+        compute_dynamic_external_forces(arm, r.outside)
     else:
-        static_balance(arm, r.outside)
+        compute_static_external_forces(arm, r.outside)
     if not solve_tip_force(arm, r.outside, out):
         return STATUS_SINGULAR
     for i in range(len(out)):
@@ -375,7 +375,7 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     return STATUS_GOOD if good else STATUS_BAD
 
 
-@allocation_free
+@compile_without_allocation
 def _reset_filter(state, value):
     """Set the state of a filter as if its input had always been `value`; both derivatives are 0."""
     state[VALUE], state[RATE], state[SECOND_DERIVATIVE], state[LAST_READING] = (
@@ -386,7 +386,7 @@ def _reset_filter(state, value):
     )
 
 
-@allocation_free
+@compile_without_allocation
 def _get_reading(r, c):
     """Return the index of signal c in the arm's state vector, and the last valid reading of its sensor.
 
@@ -399,7 +399,7 @@ def _get_reading(r, c):
     return 2 * n + 4 * i + 2 + side, r.last[_HEAD_ROW + side, r.valve[i]]
 
 
-@allocation_free
+@compile_without_allocation
 def _store_readings(last, still, used, values):
     """Store the finite ones of new readings, and count how long each channel has not changed.
 
@@ -426,7 +426,7 @@ def _store_readings(last, still, used, values):
     return good
 
 
-@allocation_free
+@compile_without_allocation
 def _has_all_readings(readings):
     """Return whether all used channels have had a finite reading."""
     for i in readings.position:
@@ -458,7 +458,7 @@ def _readings_record(r: DriveReadings) -> np.ndarray:
 
 
 @compiled
-def _step_records(arm, kept, dynamic, count, joint, head, rod, out):
+def _update_force_from_records(arm, kept, dynamic, count, joint, head, rod, out):
     """Unpack the records of arm and readings and update the force at the tip (`endpoint_force_step`).
 
     Returns:
@@ -535,11 +535,11 @@ class EndpointForce:
             if len(found.value) != len(self._arm.gravity):
                 raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
             self._arm.gravity[:] = found.value
-        self._readings = _create_readings(machine, self.axes, period * every, bandwidth, motion_bandwidth, where)
-        noise = noise_gains(self._readings.tables[0])[1]
+        self._readings = _create_reading_filters(machine, self.axes, period * every, bandwidth, motion_bandwidth, where)
+        noise = filter_noise_gains(self._readings.tables[0])[1]
         for i, name in enumerate(independent_axes(machine, where)):
             channel = f"{machine.position_kind(name)}.{name}"
-            self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
+            self._arm.rate_noise[i] = noise * reading_noise_rms(machine, sensors, channel)
         self.delay = filter_delay(motion_bandwidth) + filter_delay(bandwidth)
         self.task = _TASK_COORDINATES[: len(self._arm.joint)]
         self.force, self._max_constant_readings = np.zeros(len(self.task)), 0
@@ -562,7 +562,7 @@ class EndpointForce:
         held, self._tick = self._tick % self._every, self._tick + 1
         if held:
             return self.force
-        status, self._max_constant_readings = _step_records(
+        status, self._max_constant_readings = _update_force_from_records(
             *self._records, self._dynamic, self._count, joint, head, rod, self.force
         )
         self._count += status != STATUS_WAITING
@@ -591,7 +591,7 @@ class EndpointForce:
         )
 
 
-def _create_readings(
+def _create_reading_filters(
     machine: Machine,
     axes: tuple[str, ...],
     period: float,
@@ -619,7 +619,7 @@ def _create_readings(
     return DriveReadings(
         period=period,
         settle=max(1, round(_SETTLING_PERIODS / (motion_bandwidth * period))),
-        tables=np.array([filter_table(motion_bandwidth, period), filter_table(bandwidth, period)]),
+        tables=np.array([filter_step_matrix(motion_bandwidth, period), filter_step_matrix(bandwidth, period)]),
         position=np.array([axes.index(name) for name in free]),
         valve=np.array([axes.index(name) for name in valves]),
         state=np.zeros((n + 2 * h + len(arm_joints(machine)), 4)),

@@ -52,8 +52,8 @@ def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> Forc
     chain = load_closed_chain(machine, dict(zip(joints, plan.reference[0], strict=True)))
     setup = machine_setup(machine, chain)
     step = float(plan.time[1] - plan.time[0])
-    motion = _differentiate_reference(plan.reference, step)
-    found = setup.project(plan.reference, motion.rate, motion.acceleration)
+    motion = _smooth_and_differentiate_reference(plan.reference, step)
+    found = setup.project_motion_on_drives(plan.reference, motion.rate, motion.acceleration)
     table = make_regressor(
         chain,
         found,
@@ -69,7 +69,7 @@ def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> Forc
     return ForceReferences(True, np.ascontiguousarray(force), np.ascontiguousarray(rate))
 
 
-def _differentiate_reference(reference: np.ndarray, step: float) -> SmoothedSignal:
+def _smooth_and_differentiate_reference(reference: np.ndarray, step: float) -> SmoothedSignal:
     """Return a joint reference (n, k) with its rates and accelerations, low-pass filtered without delay.
 
     `step` is the time between rows [s]. A reference that is too short is not filtered.

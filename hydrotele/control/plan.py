@@ -153,11 +153,11 @@ def _build_plan(
                 plan.command[:, _find_column(axes, name, "pilot.commands")] = value
             return plan
         case TablePilot():
-            return _plan_table(plan, pilot)
+            return _plan_from_table(plan, pilot)
         case FourierPilot():
             return _plan_fourier(plan, pilot)
         case LinesPilot():
-            return _plan_lines(plan, machine, pilot)
+            return _plan_straight_tip_moves(plan, machine, pilot)
         case WaypointsPilot():
             return _plan_waypoints(plan, machine, pilot)
         case TeleopPilot():
@@ -186,7 +186,7 @@ def _find_column(axes: tuple[str, ...], name: str, where: str) -> int:
     return axes.index(name)
 
 
-def _plan_table(plan: Plan, pilot: TablePilot) -> Plan:
+def _plan_from_table(plan: Plan, pilot: TablePilot) -> Plan:
     times = np.array(pilot.time)
     closed = plan.closed_loop.copy()
     for name, values in pilot.columns.items():
@@ -260,9 +260,9 @@ def _trapezoidal_speed(time: np.ndarray, distance: float, speed: float, accelera
     return acceleration * ramp * rise, 2 * ramp + cruise
 
 
-def _plan_lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
+def _plan_straight_tip_moves(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
     motion = ResolvedMotion.from_joints(machine, dict(zip(plan.axes, plan.reference[0], strict=True)))
-    rates = _rate_commands(plan.time, pilot)
+    rates = _tip_rate_commands(plan.time, pilot)
     dt = np.diff(plan.time, prepend=plan.time[0])
     pose = np.empty((len(plan.time), len(motion.pose)))
     wanted = np.cumsum(rates * dt[:, None], axis=0)
@@ -279,7 +279,7 @@ def _plan_lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
             column = plan.axes.index(name)
             plan.reference[row, column] = value
             plan.rate[row, column] = speeds[name]
-    notes = note_early_end(plan.time, lines_duration(pilot))
+    notes = note_early_end(plan.time, tip_moves_duration(pilot))
     if blocked:
         seconds = blocked * (plan.time[1] - plan.time[0])
         notes += (f"resolved motion was held at the edge of the workspace for {seconds:.3g} s",)
@@ -287,7 +287,7 @@ def _plan_lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
     return dataclasses.replace(plan, closed_loop=closed, pose=pose, notes=notes)
 
 
-def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
+def _tip_rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
     rates = np.zeros((len(time), 5))
     begin = pilot.settle
     for move in pilot.moves:
@@ -302,7 +302,7 @@ def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
     return rates
 
 
-def lines_duration(pilot: LinesPilot) -> float:
+def tip_moves_duration(pilot: LinesPilot) -> float:
     """Return the time [s] that a lines pilot (straight moves of the tip) needs for all moves and pauses."""
     total = pilot.settle
     for move in pilot.moves:

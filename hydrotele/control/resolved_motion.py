@@ -1,10 +1,10 @@
 """Resolved motion in cylindrical coordinates (r, theta, z, attitude, head), by rate or position.
 
-`follow_pose` computes joint references by inverse kinematics and their rates by the inverse
+`step_references_to_pose` computes joint references by inverse kinematics and their rates by the inverse
 Jacobian, so that no error is integrated. If a step would leave the workspace or a joint range, the
 reference is held and `is_blocked` is set until the command returns to the held pose.
 
-`follow_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
+`step_references_by_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
 measured joint angles, integrated to references. Errors of the direction accumulate.
 """
 
@@ -20,15 +20,15 @@ from hydrotele.kinematics.from_machine import (
     arm_geometry,
     feller_geometry,
     is_planar_arm,
-    solve_tip_position,
+    solve_joints_for_tip,
     tip_position,
 )
 from hydrotele.kinematics.task import (
     REACHED,
     arm_parameters,
-    task_forward,
-    task_inverse,
-    task_rates,
+    compute_joint_rates,
+    compute_tip_pose,
+    solve_joint_angles,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Pose
@@ -38,11 +38,11 @@ _RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: a
 
 
 @compiled
-def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
+def step_references_to_pose(arm_constants, ranges, target, rate, blocked, pose, q, speed):
     """Set joint references to the inverse kinematics of a target pose, or hold them if it is out of reach.
 
     Args:
-        g: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_constants: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         target: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) time derivative of the target [m/s], [rad/s].
@@ -64,12 +64,12 @@ def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
         for i in range(max(k, 3)):
             if i < k and not abs(target[i] - pose[i]) <= _RELEASE_DISTANCE:
                 held = True
-    held = held or task_inverse(g, target, q[0], found) != 0
+    held = held or solve_joint_angles(arm_constants, target, q[0], found) != 0
     if not held:
         for i in range(k):
             if not ranges[i, 0] <= found[i] <= ranges[i, 1]:
                 held = True
-    held = held or task_rates(g, found, target, rate, speed) != 0
+    held = held or compute_joint_rates(arm_constants, found, target, rate, speed) != 0
     if held:
         speed[:] = 0.0
         return True
@@ -83,11 +83,11 @@ def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
 
 
 @compiled
-def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
+def step_references_by_rate(arm_constants, ranges, measured, rate, period, pose, q, speed):
     """Convert a rate of the tip to joint rates and integrate the joint references, or hold them at a limit.
 
     Args:
-        g: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_constants: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         measured: (k,) joint angles at which the Jacobian is evaluated [rad].
         rate: (5,) rate of r, theta, z, attitude and head [m/s], [rad/s].
@@ -108,8 +108,8 @@ def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
     for i in range(k):
         held = held or not math.isfinite(measured[i])
     if not held:
-        task_forward(g, measured, there)
-        held = task_rates(g, measured, there, rate, speed) != 0
+        compute_tip_pose(arm_constants, measured, there)
+        held = compute_joint_rates(arm_constants, measured, there, rate, speed) != 0
     if not held:
         for i in range(k):
             if not ranges[i, 0] <= q[i] + period * speed[i] <= ranges[i, 1]:
@@ -119,7 +119,7 @@ def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
         return True
     for i in range(k):
         q[i] += period * speed[i]
-    task_forward(g, q, pose)
+    compute_tip_pose(arm_constants, q, pose)
     return False
 
 
@@ -153,7 +153,7 @@ class ResolvedMotion:
         numbers, axes, ranges = arm_specification(machine)
         q = tuple(float(joints[a]) for a in axes)
         pose = np.zeros(5)
-        task_forward(numbers, np.array(q), pose)
+        compute_tip_pose(numbers, np.array(q), pose)
         return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
 
     def step_by_rate(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
@@ -181,7 +181,7 @@ class ResolvedMotion:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
         """
         pose, q, speed = _pad_to_five(self.pose), np.array(self.joints), np.zeros(len(self.axes))
-        blocked = follow_pose(
+        blocked = step_references_to_pose(
             self.arm_geometry_parameters,
             self.ranges,
             _pad_to_five(target),
@@ -265,11 +265,11 @@ def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], wher
     if head is None:
         head = current[axes[4]] if len(axes) == 5 else 0.0
     joints, wanted = np.zeros(len(axes)), np.array([pose.r, pose.theta, pose.z, attitude, head])
-    if task_inverse(numbers, wanted, pose.theta, joints) != REACHED:
+    if solve_joint_angles(numbers, wanted, pose.theta, joints) != REACHED:
         raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
     if len(axes) == 3 and not is_planar_arm(machine):
         place = (pose.r * math.cos(pose.theta), pose.r * math.sin(pose.theta), pose.z)
-        joints = solve_tip_position(machine, np.array(place), joints)
+        joints = solve_joints_for_tip(machine, np.array(place), joints)
         if not np.allclose(tip_position(machine, joints), place, rtol=0.0, atol=1e-6):
             raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
     for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):

@@ -60,7 +60,7 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
         gains = [position_gain, servo.velocity_gain, servo.deadband_compensation, filtered]
         gains += [machine.supply.bulk_modulus if machine.supply else 0.0, servo.pressure_feedback]
         if axis.valve and machine.supply:
-            head, rod = axis.hydraulic_drive.areas
+            head, rod = axis.hydraulic_drive.effective_areas
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
             facts = [_HYDRAULIC_DRIVE, head, rod, flow_gain, axis.valve.deadband]
             rows.append([*facts, machine.supply.tank_pressure, 1.0, 0.0, *gains])
@@ -121,7 +121,7 @@ def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> Driv
             x = np.asarray(linkage.length(plan.reference[:, column]))
             if axis.cylinder:
                 x = np.clip(x - axis.cylinder.closed_length, 0.0, axis.cylinder.stroke)
-            head[:, column], rod[:, column] = axis.hydraulic_drive.volumes(x)
+            head[:, column], rod[:, column] = axis.hydraulic_drive.chamber_volumes(x)
     return DriveReferences(velocity, arm, head, rod)
 
 
@@ -280,7 +280,7 @@ _LOW, _STEP = range(2)
 _DEFAULT_HALF_RANGE = 1.0  # rad or m, half range for a joint without a range; its drive is direct
 
 
-def tabulate_drives(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def tabulate_drive_geometry(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Tabulate moment arms and chamber volumes over the joints' ranges.
 
     Args:
@@ -303,7 +303,7 @@ def tabulate_drives(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray
             x = np.asarray(linkage.length(places))
             if axis.cylinder:
                 x = np.clip(x - axis.cylinder.closed_length, 0.0, axis.cylinder.stroke)
-            table[i, :, 1], table[i, :, 2] = axis.hydraulic_drive.volumes(x)
+            table[i, :, 1], table[i, :, 2] = axis.hydraulic_drive.chamber_volumes(x)
     return grid, table
 
 
@@ -312,8 +312,8 @@ def interpolate_drive_reference(grid, table, reference, rate, scale, velocity, a
     """Interpolate moment arms and chamber volumes in tables and compute drive velocities for one tick.
 
     Args:
-        grid: (k, 2) of `tabulate_drives`.
-        table: (k, TABLE_POINTS, 3) of `tabulate_drives`.
+        grid: (k, 2) of `tabulate_drive_geometry`.
+        table: (k, TABLE_POINTS, 3) of `tabulate_drive_geometry`.
         reference: (k,) joint references [rad] or [m].
         rate: (k,) rates of the references [rad/s] or [m/s].
         scale: factor of the velocities, the servo's feedforward; scalar.

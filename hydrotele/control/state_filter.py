@@ -9,14 +9,14 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 
 VALUE, RATE, SECOND_DERIVATIVE, LAST_READING = range(4)  # columns of a filter's state
 _MIN_RELATIVE_POWER = 1.0e-12
 _REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # coefficients of the third-order Butterworth polynomial
 
 
-def filter_table(bandwidth: float, period: float) -> np.ndarray:
+def filter_step_matrix(bandwidth: float, period: float) -> np.ndarray:
     """Return the matrix that advances the low-pass filter and its two derivatives by one period.
 
     The filter is `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), with input u and output y.
@@ -32,7 +32,7 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     Source: Butterworth's filter; Franklin, Powell and Workman 1998, Digital control, section 6.3
     (triangle hold).
 
-    >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
+    >>> filter_step_matrix(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
     array([0.    , 0.0119, 2.3279])
     """
     from scipy.linalg import expm  # this import takes a third of a second
@@ -73,11 +73,11 @@ def butterworth_response(bandwidth: float, s: np.ndarray) -> np.ndarray:
     return _CUBE * w**3 / (s**3 + _REAL * w * s**2 + _SQUARE * w**2 * s + _CUBE * w**3)
 
 
-def noise_gains(table: np.ndarray) -> np.ndarray:
+def filter_noise_gains(table: np.ndarray) -> np.ndarray:
     """Return the standard deviations of filter output and derivatives for white noise of unit deviation.
 
     Args:
-        table: (3, 5) of `filter_table`.
+        table: (3, 5) of `filter_step_matrix`.
 
     Returns:
         (3,) standard deviations of output [1], rate [1/s] and second derivative [1/s^2].
@@ -92,19 +92,19 @@ def noise_gains(table: np.ndarray) -> np.ndarray:
     return np.sqrt(total)
 
 
-@allocation_free
+@compile_without_allocation
 def filter_step(table, state, reading):
     """Update the filter state of one signal with the next reading.
 
     Args:
-        table: (3, 5) of `filter_table`.
+        table: (3, 5) of `filter_step_matrix`.
         state: (4,) VALUE, RATE, SECOND_DERIVATIVE and LAST_READING of the signal; updated.
         reading: u, scalar.
 
     Returns:
         Nothing.
 
-    Source: `filter_table`.
+    Source: `filter_step_matrix`.
     """
     low, rate, change, last = (
         state[VALUE],
@@ -124,13 +124,13 @@ def filter_signal(table, readings):
     """Low-pass filter a whole signal and compute its derivatives, starting at rest at the first reading.
 
     Args:
-        table: (3, 5) of `filter_table`.
+        table: (3, 5) of `filter_step_matrix`.
         readings: (r,) signal.
 
     Returns:
         (r, 3) low-pass VALUE, its RATE and its SECOND_DERIVATIVE.
 
-    Source: `filter_table`.
+    Source: `filter_step_matrix`.
     """
     state, out = np.zeros(4), np.zeros((len(readings), 3))
     state[VALUE] = state[LAST_READING] = readings[0]

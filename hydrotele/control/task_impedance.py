@@ -12,7 +12,7 @@ from hydrotele.control.state_filter import (
     SECOND_DERIVATIVE,
     VALUE,
     filter_step,
-    filter_table,
+    filter_step_matrix,
 )
 from hydrotele.core.errors import InputError
 
@@ -143,7 +143,7 @@ class TaskImpedance:
         self.mass = np.zeros(coordinates)
         self._fits: list[RecursiveLeastSquares | None] = [None] * coordinates
         self._origin = np.zeros(coordinates)
-        self._tables = [filter_table(bandwidth, period) for bandwidth in bandwidths]
+        self._tables = [filter_step_matrix(bandwidth, period) for bandwidth in bandwidths]
         self._position_states = np.full((len(bandwidths), coordinates, 4), np.nan)
         self._force_states = None if force_is_filtered else self._position_states.copy()
 
@@ -163,7 +163,7 @@ class TaskImpedance:
             felt = force[c]
             if self._force_states is not None:
                 felt = self._filter_reading(self._force_states, c, force[c])[0]
-            self._fit(c, felt, *motion)
+            self._update_coordinate_fit(c, felt, *motion)
 
     def _filter_reading(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
         """Pass a reading of coordinate c through all filters; return its value and two derivatives.
@@ -178,10 +178,10 @@ class TaskImpedance:
             reading, rate, change = state[VALUE], state[RATE], state[SECOND_DERIVATIVE]
         return reading, rate, change
 
-    def _fit(self, c: int, force: float, place: float, rate: float, change: float) -> None:
+    def _update_coordinate_fit(self, c: int, force: float, position: float, rate: float, acceleration: float) -> None:
         """Update the impedance of coordinate c with one equation; reset it to 0 without contact.
 
-        `place`, `rate` and `change` are position, velocity and acceleration.
+        `position`, `rate` and `acceleration` are position, velocity and acceleration.
         """
         if not abs(force) > _MIN_CONTACT_FORCE_N:
             self._fits[c] = None
@@ -189,14 +189,14 @@ class TaskImpedance:
             return
         fit = self._fits[c]
         if fit is None:
-            self._origin[c] = place
+            self._origin[c] = position
             fit = self._fits[c] = RecursiveLeastSquares(
                 np.zeros(4),
                 np.array(_INITIAL_STD),
                 forgetting=_FORGETTING_FACTOR,
                 reset_ratio=_RESET_ERROR_RATIO,
             )
-        fit.update(np.array([place - self._origin[c], rate, change, 1.0]), -force / 1e3)
+        fit.update(np.array([position - self._origin[c], rate, acceleration, 1.0]), -force / 1e3)
         self.stiffness[c] = max(0.0, 1e3 * fit.value[0])
         self.damping[c] = max(0.0, 1e3 * fit.value[1])
         self.mass[c] = max(0.0, 1e3 * fit.value[2])

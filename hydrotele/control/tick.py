@@ -17,8 +17,8 @@ from hydrotele.control.servo import (
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
-from hydrotele.simulate.feedback import FeedbackTable, Readings, SensorParameters, sample_sensors
-from hydrotele.simulate.stepping import read_simulation, step_physics
+from hydrotele.simulate.feedback import FeedbackTable, Readings, SensorParameters, sample_sensors_if_due
+from hydrotele.simulate.stepping import step_physics, unpack_simulation_record
 
 
 class Controller(NamedTuple):
@@ -178,7 +178,7 @@ def step_planned_run(simulated, planned, tick, steps, stopped):
 
     Source: `control_tick`.
     """
-    sim, run = read_simulation(simulated[0]), _read_planned_run(planned[0])
+    sim, run = unpack_simulation_record(simulated[0]), _read_planned_run(planned[0])
     controller, readings = run.controller, run.feedback.readings
     for i in range(len(controller.command)):
         controller.command[i] = run.command[tick, i]
@@ -192,4 +192,4 @@ def step_planned_run(simulated, planned, tick, steps, stopped):
     control_tick(sim, tick, steps, controller, reference, measured)
     for i in range(len(controller.command)):
         run.given[tick, i] = controller.command[i]
-    sample_sensors(run.feedback, sim, tick + 1, steps)
+    sample_sensors_if_due(run.feedback, sim, tick + 1, steps)

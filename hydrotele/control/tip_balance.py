@@ -1,8 +1,8 @@
 """External forces on an arm: the forces that its motion needs minus the forces of its drives.
 
-`dynamic_balance` uses the complete model, `static_balance` only gravity. `solve_tip_force` converts the
-result to a force at the tip. `create_arm_balance` prepares an arm, and `independent_axes` checks that its tip
-force can be estimated from its drives.
+`compute_dynamic_external_forces` uses the complete model, `compute_static_external_forces` only gravity.
+`solve_tip_force` converts the result to a force at the tip. `create_arm_balance` prepares an arm, and
+`independent_axes` checks that its tip force can be estimated from its drives.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_specification
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.estimate.reduced_model import model_space, place_mechanism, reduced_model, state_size
@@ -162,8 +162,8 @@ def read_arm_record(r):
     )  # fmt: skip
 
 
-@allocation_free
-def dynamic_balance(arm, external_force):
+@compile_without_allocation
+def compute_dynamic_external_forces(arm, external_force):
     """Compute external forces on an arm by the complete model: inertia, gravity, friction, closed chains.
 
     `tau = B' (M (B a + d) + h + D q') - sum r_i (F_i - f_i(v_i))` with basis B of the independent
@@ -194,11 +194,11 @@ def dynamic_balance(arm, external_force):
             need += m.mass[j, k] * way
         for f in range(n):
             external_force[f] += m.basis[j, f] * need
-    _subtract_drives(arm, True, external_force)
+    _subtract_drive_forces(arm, True, external_force)
 
 
-@allocation_free
-def static_balance(arm, external_force):
+@compile_without_allocation
+def compute_static_external_forces(arm, external_force):
     """Compute external forces on an arm by the static model, which includes only gravity.
 
     `tau = Y(q) P - sum r_i F_i` with gravity torques Y(q) P, and moment arms r_i and forces F_i of the
@@ -218,11 +218,11 @@ def static_balance(arm, external_force):
     for f in range(len(external_force)):
         external_force[f] = 0.0
     for i in range(len(arm.joint)):
-        external_force[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
-    _subtract_drives(arm, False, external_force)
+        external_force[arm.joint[i]] = joint_gravity_torque(arm.z, arm.joint, arm.gravity, i)
+    _subtract_drive_forces(arm, False, external_force)
 
 
-@allocation_free
+@compile_without_allocation
 def motion_probability(velocity, variance):
     """Return the probability that a drive moves, given its measured velocity.
 
@@ -246,8 +246,8 @@ def motion_probability(velocity, variance):
     return 1.0 / (1.0 + _VELOCITY_RANGE_RATIO * math.exp(-0.5 * velocity * velocity / variance))
 
 
-@allocation_free
-def _subtract_drives(arm, with_friction, external_force):
+@compile_without_allocation
+def _subtract_drive_forces(arm, with_friction, external_force):
     """Subtract the forces of the hydraulic drives from the external forces (n,), through their moment arms.
 
     With `with_friction`, the friction is subtracted from a drive's force, weighted by the probability
@@ -267,8 +267,8 @@ def _subtract_drives(arm, with_friction, external_force):
             external_force[f] -= sp.row[i, f] * give
 
 
-@allocation_free
-def static_torque(q, joint, gravity, i):
+@compile_without_allocation
+def joint_gravity_torque(q, joint, gravity, i):
     """Return the gravity torque on a joint of the arm, by the static model.
 
     Each link from the boom outwards has two parameters, for the cosine and the sine of its
@@ -302,7 +302,7 @@ def static_torque(q, joint, gravity, i):
     return total + gravity[6] * math.cos(head) * math.cos(angle)
 
 
-@allocation_free
+@compile_without_allocation
 def solve_tip_force(arm, external_force, out):
     """Compute the force at the tip that is equivalent to external forces on the coordinates.
 
@@ -334,7 +334,7 @@ def solve_tip_force(arm, external_force, out):
     return True
 
 
-@allocation_free
+@compile_without_allocation
 def _solve_by_elimination(table, right, m, min_pivot):
     """Solve m linear equations `table x = right` in place by Gaussian elimination with pivoting.
 

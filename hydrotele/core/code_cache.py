@@ -34,14 +34,14 @@ _LOG = logging.getLogger("hydrotele")
 _notes: set[str] = set()
 
 
-def _note_once(kind: str, text: str) -> None:
+def _warn_once(kind: str, text: str) -> None:
     """Log a warning text; only the first warning of each kind in a process is logged."""
     if kind not in _notes:
         _notes.add(kind)
         _LOG.warning(text)
 
 
-def file_stem(function) -> str:
+def cache_file_stem(function) -> str:
     """Return the beginning of the names of a function's cache files: its name and line number."""
     return f"{function.__name__}-{function.__code__.co_firstlineno}"
 
@@ -86,20 +86,20 @@ class CodeCache(NullCache):
         try:
             if self._folder is None:
                 reason = "no cache folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
-                _note_once("memory", f"compiled functions are kept in memory only: {reason}")
+                _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
             elif not cres.lifted and not cres.library.has_dynamic_globals:
-                key = self._key(sig, cres.library.codegen)
+                key = self._code_key(sig, cres.library.codegen)
                 content = dumps((key, external_callees(cres), cres._reduce()))
-                _write_atomically(self._path(key), hashlib.sha256(content).digest() + content)
+                _write_atomically(self._code_file(key), hashlib.sha256(content).digest() + content)
         except OSError as error:
             reason = f"{self._folder} cannot be written, {error.strerror or error}"
-            _note_once("memory", f"compiled functions are kept in memory only: {reason}")
+            _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
         finally:
             self._release_lock()
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        key = self._key(sig, target_context.codegen())
-        content = _read_verified(self._path(key))
+        key = self._code_key(sig, target_context.codegen())
+        content = _read_verified(self._code_file(key))
         if content is None:
             return None
         stored_key, callees, code = pickle.loads(content)
@@ -107,7 +107,7 @@ class CodeCache(NullCache):
             return None
         return CompileResult._rebuild(target_context, *code)
 
-    def _key(self, sig: Any, codegen: Any) -> tuple:
+    def _code_key(self, sig: Any, codegen: Any) -> tuple:
         """Return a tuple of all that determines the compiled code of a signature.
 
         It contains form, versions, signature, processor, name, bytecode and closure, but not the sources of
@@ -118,10 +118,10 @@ class CodeCache(NullCache):
         digests = [hashlib.sha256(part).hexdigest() for part in parts]
         return self._form, _VERSIONS, sig, codegen.magic_tuple(), self._function.__qualname__, *digests
 
-    def _path(self, key: tuple) -> Path:
+    def _code_file(self, key: tuple) -> Path:
         assert self._folder
         digest = hashlib.sha256(repr(key).encode()).hexdigest()
-        return self._folder / f"{file_stem(self._function)}.{digest[:16]}.code"
+        return self._folder / f"{cache_file_stem(self._function)}.{digest[:16]}.code"
 
     def _release_lock(self) -> None:
         if self._lock_handle is not None:
@@ -141,7 +141,7 @@ def _read_verified(path: Path) -> bytes | None:
         return None
     except OSError as error:
         reason = error.strerror or str(error)
-    _note_once("damaged", f"damaged compiled code is compiled again: {path}: {reason}")
+    _warn_once("damaged", f"damaged compiled code is compiled again: {path}: {reason}")
     return None
 
 
@@ -162,7 +162,7 @@ def _acquire_lock(folder: Path, function) -> int | None:
     Returns None after a timeout, and if the file system allows no lock.
     """
     try:
-        handle = os.open(folder / f"{file_stem(function)}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        handle = os.open(folder / f"{cache_file_stem(function)}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError:
         return None
     began, line = time.monotonic(), ProgressLine()

@@ -93,11 +93,11 @@ class CompileProgress(event.Listener):
             # The compiler creates millions of objects that all live until it ends.
             self._gc_was_enabled = gc.isenabled()
             gc.disable()
-            self._pending = self._find_pending(dispatcher)
+            self._pending = self._find_uncompiled_functions(dispatcher)
             self._total, self._done = sum(self._pending.values()), 0
             self._start_time = time.monotonic()
             if self._thread is None:
-                self._thread = threading.Thread(target=self._draw, daemon=True)
+                self._thread = threading.Thread(target=self._redraw_periodically, daemon=True)
                 self._thread.start()
         self._names.append(dispatcher.py_func.__name__.strip("_"))
 
@@ -114,7 +114,7 @@ class CompileProgress(event.Listener):
             with self._lock:
                 self._line.clear()
 
-    def _find_pending(self, dispatcher: Any) -> dict[FunctionType, int]:
+    def _find_uncompiled_functions(self, dispatcher: Any) -> dict[FunctionType, int]:
         """Return the functions that have to be compiled for numba's dispatcher of a function.
 
         They are the function and all uncached functions that it calls, directly or indirectly. The values
@@ -129,7 +129,7 @@ class CompileProgress(event.Listener):
             left += [d for d in called_dispatchers(function) if not self._is_cached(d.py_func)]
         return found
 
-    def _draw(self) -> None:
+    def _redraw_periodically(self) -> None:
         """Update the progress bar periodically; runs in the background thread."""
         while True:
             time.sleep(_REDRAW_INTERVAL)

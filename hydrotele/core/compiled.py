@@ -30,7 +30,7 @@ from numba.core.caching import NullCache
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 
-from hydrotele.core.code_cache import CodeCache, file_stem
+from hydrotele.core.code_cache import CodeCache, cache_file_stem
 from hydrotele.core.compile_progress import CompileProgress
 from hydrotele.core.linking import Callee
 from hydrotele.core.references import argument_type
@@ -45,28 +45,28 @@ def compiled(function):
     cached on disk. If no cache folder is writable, every process compiles the function again. The
     compiled function releases Python's global interpreter lock, so that threads run in parallel.
     """
-    return _compile(function)
+    return _make_dispatcher(function)
 
 
-def allocation_free(function):
+def compile_without_allocation(function):
     """Compile a function that neither creates nor returns arrays; a decorator like `compiled`.
 
     This omits reference counting of arrays, which takes half the run time of small functions. A
     function that does create or return an array raises an error on its first call.
     """
-    return _compile(function, _nrt=False)
+    return _make_dispatcher(function, _nrt=False)
 
 
-def inlined(function):
+def compile_inlined(function):
     """Compile a small function whose code is copied into every caller; a decorator.
 
     The function must neither create nor return arrays. Results that a caller does not use, such as a
     derivative, are then not computed, and constant arguments are folded.
     """
-    return _compile(function, _nrt=False, forceinline=True)
+    return _make_dispatcher(function, _nrt=False, forceinline=True)
 
 
-def _compile(function, **options: Any):
+def _make_dispatcher(function, **options: Any):
     """Create numba's dispatchers of a function: one for calls from Python, one for compiled callers.
 
     A dispatcher compiles the function for each combination of argument types. The second one has no
@@ -269,7 +269,7 @@ def _module_cache_folder(module: str) -> Path | None:
 def _is_cached(function) -> bool:
     """Return whether the cache contains any code of a function of this package."""
     folder = _module_cache_folder(function.__module__)
-    return folder is not None and any(folder.glob(f"{file_stem(function)}.*.code"))
+    return folder is not None and any(folder.glob(f"{cache_file_stem(function)}.*.code"))
 
 
 event.register("numba:compile", CompileProgress(_is_cached))

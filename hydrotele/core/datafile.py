@@ -17,7 +17,7 @@ import yaml
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import describe_excess, get_limit, read_text
-from hydrotele.core.units import KEY_SUFFIXES, to_si
+from hydrotele.core.units import KEY_SUFFIXES, si_unit_and_factor
 
 MAX_MAGNITUDE = 1.0e20  # largest magnitude of a number in SI; keeps products of a few numbers finite
 Number = Annotated[float, pydantic.Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
@@ -57,7 +57,7 @@ def split_unit(key: str) -> tuple[str, float | None]:
         if key.endswith(suffix):
             stem = key.removesuffix(suffix)
             turns = suffix == "_hz" and stem in ANGULAR_FREQUENCY_KEYS
-            return stem, 2.0 * math.pi if turns else to_si(unit)[1]
+            return stem, 2.0 * math.pi if turns else si_unit_and_factor(unit)[1]
     return key, None
 
 

@@ -172,11 +172,11 @@ def parse_xml(
         depth -= 1
         builder.end(tag)
 
-    def refuse(*_: Any) -> None:
+    def refuse_document_type(*_: Any) -> None:
         raise InputError(path, "declares a document type, which MuJoCo does not read; remove <!DOCTYPE ...>")
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = refuse
+    parser.StartDoctypeDeclHandler = refuse_document_type
     parser.CharacterDataHandler = builder.data
     try:
         parser.Parse(content, True)

@@ -259,7 +259,7 @@ class _Reader:
         values = 0.0
         if root.tag == "robot":
             self._resolve_urdf_meshes(root, path)
-        folders = self._remove_folders(root)
+        folders = self._extract_asset_folders(root)
         references = _file_references(root)
         for element, attribute in references:
             if element.tag == "model":
@@ -273,7 +273,7 @@ class _Reader:
             with open_regular(file) as opened:
                 size = os.fstat(opened.fileno()).st_size
                 self.asset_bytes += size
-                check_limit(self._describe(element, attribute), "ASSET_BYTES", self.asset_bytes)
+                check_limit(self._format_attribute_location(element, attribute), "ASSET_BYTES", self.asset_bytes)
                 values += _count_pixels(opened.read(24))
             vertices[element] = size / _BYTES_PER_FLEX_VERTEX
             element.set(attribute, str(file))
@@ -291,14 +291,16 @@ class _Reader:
 
     def _expand_includes(self, element: Element, path: Path, main: Path, included: set[Path], depth: int) -> None:
         """Replace the `include` elements below an element by the content of their files, in place."""
-        check_limit(self._place(element), "FILE_DEPTH", depth)
+        check_limit(self._format_location(element), "FILE_DEPTH", depth)
         for child in list(element):
             if child.tag != "include":
                 self._expand_includes(child, path, main, included, depth + 1)
                 continue
-            where = self._describe(child, "file")
+            where = self._format_attribute_location(child, "file")
             if len(child) or not child.get("file"):
-                raise InputError(self._place(child), "an <include> must have the attribute file and no children")
+                raise InputError(
+                    self._format_location(child), "an <include> must have the attribute file and no children"
+                )
             file = _find_file(PurePosixPath(child.attrib["file"]), main.parent, path.parent)
             if file.resolve() in included:
                 raise InputError(
@@ -315,7 +317,7 @@ class _Reader:
             index = list(element).index(child)
             element[index : index + 1] = list(content)
 
-    def _remove_folders(self, root: Element) -> dict[str, str]:
+    def _extract_asset_folders(self, root: Element) -> dict[str, str]:
         """Return the asset folders of the compiler elements, and remove them from the document."""
         folders: dict[str, str] = {}
         for compiler in root.iter("compiler"):
@@ -338,7 +340,7 @@ class _Reader:
             with open_regular(file):
                 return file.absolute()
         except InputError as error:
-            raise InputError(self._describe(element, attribute), f"{file}: {error.message}") from None
+            raise InputError(self._format_attribute_location(element, attribute), f"{file}: {error.message}") from None
 
     def _read_model(self, element: Element, path: Path, parents: tuple[Path, ...]) -> tuple[str, MjcfDocument, float]:
         """Read the document of a `model` asset, or return it if it was read before.
@@ -351,7 +353,7 @@ class _Reader:
         Returns:
             Generated unique name, document, and number of its elements with all copies.
         """
-        where = self._describe(element, "file")
+        where = self._format_attribute_location(element, "file")
         file = _find_file(_portable_path(element.attrib["file"]), self.origins[element][0].parent, path.parent)
         key = file.resolve()
         if key in parents:
@@ -381,16 +383,16 @@ class _Reader:
             if file.exists():
                 with open_regular(file) as opened:
                     self.asset_bytes += os.fstat(opened.fileno()).st_size
-                check_limit(f"{self._place(mesh)}: {file}", "ASSET_BYTES", self.asset_bytes)
+                check_limit(f"{self._format_location(mesh)}: {file}", "ASSET_BYTES", self.asset_bytes)
             mesh.set("filename", str(file.absolute()))
         compiler.set("strippath", "false")
 
-    def _place(self, element: Element) -> str:
+    def _format_location(self, element: Element) -> str:
         path, line = self.origins[element]
         return f"{path}:{line}"
 
-    def _describe(self, element: Element, attribute: str) -> str:
-        return f"{self._place(element)}: <{element.tag} {attribute}={element.get(attribute)!r}>"
+    def _format_attribute_location(self, element: Element, attribute: str) -> str:
+        return f"{self._format_location(element)}: <{element.tag} {attribute}={element.get(attribute)!r}>"
 
 
 def _portable_path(name: str) -> PurePosixPath:
@@ -440,13 +442,13 @@ def _count_elements(
     most_elements: dict[Element, float] = {}
     most_values: dict[Element, float] = {}
 
-    def locate(amounts: Mapping[Element, float]) -> str:
+    def locate_largest_element(amounts: Mapping[Element, float]) -> str:
         """Return file, line and tag of the element with the largest amount, as text."""
         element = max(amounts, key=lambda element: amounts[element])
         file, line = origins.get(element, (path, 0))
         return f"{file}:{line}: <{element.tag}>"
 
-    def read(element: Element, attribute: str) -> list[float]:
+    def read_numbers(element: Element, attribute: str) -> list[float]:
         try:
             found = [abs(float(word)) for word in element.get(attribute, "").split()]
         except ValueError:
@@ -457,41 +459,41 @@ def _count_elements(
             raise InputError(f"{file}:{line}", said)
         return found
 
-    def walk(element: Element, copies: float, is_default: bool) -> None:
+    def count_subtree(element: Element, copies: float, is_default: bool) -> None:
         nonlocal values
         tag, own = element.tag, 1.0
         if tag in _GENERATORS:
-            own += math.prod(number for key in _GRID_ATTRIBUTES for number in read(element, key))
+            own += math.prod(number for key in _GRID_ATTRIBUTES for number in read_numbers(element, key))
             own += vertices.get(element, 0.0)
         elif tag == "attach":
             own += models.get(element.get("model", ""), 0.0)
         elif tag == "size":
-            own += sum(read(element, "nkey"))
+            own += sum(read_numbers(element, "nkey"))
             for key in element.attrib:
                 if key.startswith("nuser_"):
-                    user_values[element] = user_values.get(element, 0.0) + sum(read(element, key))
+                    user_values[element] = user_values.get(element, 0.0) + sum(read_numbers(element, key))
                 elif key == "nuserdata":
-                    values += sum(read(element, key))
-        stored = [number for key in _SIZE_ATTRIBUTES if key in element.attrib for number in read(element, key)]
+                    values += sum(read_numbers(element, key))
+        stored = [number for key in _SIZE_ATTRIBUTES if key in element.attrib for number in read_numbers(element, key)]
         stated = math.prod(stored) if stored else 0.0
         if tag == "mesh" and element.get("builtin"):
-            stated = _VALUES_PER_MESH_VERTEX * max(read(element, "params"), default=0.0) ** 2
+            stated = _VALUES_PER_MESH_VERTEX * max(read_numbers(element, "params"), default=0.0) ** 2
         if is_default:
             sizes[tag] = max(sizes.get(tag, 0.0), stated)
         tags[tag] += copies * own  # type: ignore[assignment]
         values += copies * stated
         most_elements[element], most_values[element] = copies * own, copies * stated
         if tag == "replicate":
-            copies *= max(1.0, math.prod(read(element, "count")))
+            copies *= max(1.0, math.prod(read_numbers(element, "count")))
         for child in element:
-            walk(child, copies, is_default or tag == "default")
+            count_subtree(child, copies, is_default or tag == "default")
 
-    walk(root, 1.0, False)
+    count_subtree(root, 1.0, False)
     elements = tags.total() + sum(models.values())
-    check_limit(locate(most_elements), "MJCF_ELEMENTS", elements)
+    check_limit(locate_largest_element(most_elements), "MJCF_ELEMENTS", elements)
     values += sum(size * tags[tag] for tag, size in sizes.items())
     for element, size in user_values.items():
         most_values[element] += size * elements
         values += size * elements
-    check_limit(locate(most_values), "MJCF_VALUES", values)
+    check_limit(locate_largest_element(most_values), "MJCF_VALUES", values)
     return elements

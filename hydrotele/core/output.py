@@ -111,7 +111,7 @@ def check_output_folder(target: str | Path, kind: str) -> None:
         return
     if not place.is_dir():
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
-    if any(place.iterdir()) and _read_kind(place) != kind:
+    if any(place.iterdir()) and _read_output_kind(place) != kind:
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
     patterns = ("summary.json", *OUTPUT_FILES[kind])
     inside = sorted(path.relative_to(place).as_posix() for path in place.rglob("*"))
@@ -128,7 +128,7 @@ def _is_match(name: str, pattern: str) -> bool:
     return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 
 
-def _read_kind(folder: Path) -> str | None:
+def _read_output_kind(folder: Path) -> str | None:
     """Return the kind stated in a folder's `summary.json`; None if it cannot be read."""
     try:
         return read_json(folder / "summary.json").get("kind")

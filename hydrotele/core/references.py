@@ -74,18 +74,18 @@ def argument_type(kind: Any) -> Any:
         A `Reference` for a large named tuple; the non-literal type for a constant, so that a
         function is not compiled for each constant; otherwise `kind` itself.
     """
-    if isinstance(kind, _NAMED_TUPLES) and count_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
+    if isinstance(kind, _NAMED_TUPLES) and count_native_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
         return Reference(kind)
     return types.unliteral(kind)
 
 
-def count_arguments(kind: Any) -> int:
+def count_native_arguments(kind: Any) -> int:
     """Return the number of machine-level arguments for a value of a numba type passed by value.
 
     A scalar has 1, an array 5 plus 2 per dimension, a tuple the sum of its items.
     """
     if isinstance(kind, types.BaseTuple) and not isinstance(kind, Reference):
-        return sum(count_arguments(part) for part in _item_types(kind))
+        return sum(count_native_arguments(part) for part in _item_types(kind))
     return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
 
 

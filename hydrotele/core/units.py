@@ -104,28 +104,28 @@ def canonical_unit(text: str) -> str:
     return _SPELLINGS.get(unit, unit)
 
 
-def to_si(unit: str) -> tuple[str, float]:
+def si_unit_and_factor(unit: str) -> tuple[str, float]:
     """Return the SI unit that corresponds to a unit, and the factor by which values are multiplied.
 
     An unknown unit is returned unchanged with factor 1.
 
-    >>> to_si("bar")
+    >>> si_unit_and_factor("bar")
     ('Pa', 100000.0)
     """
     unit = canonical_unit(unit)
     return UNITS.get(unit, (unit, 1.0))
 
 
-def axis_unit(unit: str) -> tuple[str, float]:
+def plot_axis_unit(unit: str) -> tuple[str, float]:
     """Return the unit used on the axes of plots for an SI unit, and the factor to multiply values by.
 
-    >>> axis_unit("Pa")
+    >>> plot_axis_unit("Pa")
     ('MPa', 1e-06)
-    >>> axis_unit("1")
+    >>> plot_axis_unit("1")
     ('1', 1.0)
     """
     shown = _AXIS_UNITS.get(unit, unit)
-    return shown, 1.0 / to_si(shown)[1]
+    return shown, 1.0 / si_unit_and_factor(shown)[1]
 
 
 def display_unit(unit: str, magnitude: float, parameter: str = "") -> tuple[str, float]:
@@ -146,5 +146,5 @@ def display_unit(unit: str, magnitude: float, parameter: str = "") -> tuple[str,
         return "Hz", 0.5 / math.pi
     for least, shown in _REPORT_UNITS.get(unit, ()):
         if abs(magnitude) >= least or not math.isfinite(magnitude):
-            return shown, 1.0 / to_si(shown)[1]
+            return shown, 1.0 / si_unit_and_factor(shown)[1]
     return unit, 1.0

@@ -80,7 +80,7 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
                 del LAWS[name]
             raise
         _loaded_effects[digest] = tuple(effect.name for effect in family)
-        _export_to_children(path)
+        _pass_file_to_child_processes(path)
     return _loaded_effects[digest]
 
 
@@ -107,14 +107,14 @@ def _execute_file(path: Path, digest: str) -> tuple[Any, ...]:
         raise
     except (Exception, SystemExit) as error:  # any error of the user's code, also exit()
         del sys.modules[name]
-        found = describe_user_error(error) or InputError(path, _describe_exception(error))
+        found = locate_error_in_effect_file(error) or InputError(path, _describe_exception(error))
         raise InputError(found.where, f"cannot be run: {found.message}") from error
 
 
 _effect_files: dict[str, Path] = {}  # absolute path of every effect file that was run -> path as given
 
 
-def describe_user_error(error: BaseException) -> InputError | None:
+def locate_error_in_effect_file(error: BaseException) -> InputError | None:
     """Find the line of a user's effect file that caused an exception.
 
     Args:
@@ -164,7 +164,7 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
     library.update((effect.name, effect) for effect in family)
 
 
-def _export_to_children(path: Path) -> None:
+def _pass_file_to_child_processes(path: Path) -> None:
     """Add an effect file to the environment variable from which child processes load their effects."""
     known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
     if str(resolve_path(path)) not in known:
@@ -193,7 +193,7 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
         _add_to_library(library, _collect_effects(content), where)
 
 
-def add_environment_effects(library: dict[str, Effect]) -> None:
+def add_effects_from_environment_variable(library: dict[str, Effect]) -> None:
     """Add the custom effects that the parent process loaded to a library, updated in place.
 
     The environment variable `HYDROTELE_EFFECTS` lists the files, which are run again.
@@ -290,4 +290,4 @@ def apply_effect(machine: Machine, name: str, location: str, values: Mapping[str
 
 
 add_plugin_effects(EFFECTS)
-add_environment_effects(EFFECTS)
+add_effects_from_environment_variable(EFFECTS)

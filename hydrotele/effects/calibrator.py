@@ -11,7 +11,7 @@ from hydrotele.effects.effect import Effect, Parameter, Values, with_value
 from hydrotele.machine.machine import Machine, SensorError
 
 
-def _sensed_joints(machine: Machine) -> tuple[str, ...]:
+def _undriven_sensed_joints(machine: Machine) -> tuple[str, ...]:
     return machine.undriven_sensed_joints
 
 
@@ -41,7 +41,7 @@ def _set_bending(machine: Machine, joint: str, values: Values) -> Machine:
     return with_value(machine, f"links.{machine.link_of(joint)}.joint.bending", values["compliance"])
 
 
-def _misalignment_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
+def _sensor_misalignment_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the tilt between a joint and its angle sensor.
 
     Couplings are aligned to a few degrees. A tilt of 3 degrees causes an angle error with an
@@ -53,11 +53,11 @@ def _misalignment_parameters(machine: Machine, joint: str) -> dict[str, Paramete
     return {"tilt": Parameter("rad", present, 0.0, high, 5.0 * one, 3.0 * one, (10.0 * one,))}
 
 
-def _set_misalignment(machine: Machine, joint: str, values: Values) -> Machine:
+def _set_sensor_misalignment(machine: Machine, joint: str, values: Values) -> Machine:
     return _with_sensor_error(machine, joint, tilt=values["tilt"])
 
 
-def _backlash_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
+def _sensor_backlash_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the backlash between a joint and its angle sensor.
 
     A loose coupling has some tenths of a degree; the resolver resolves one tenth.
@@ -68,15 +68,15 @@ def _backlash_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
     return {"gap": Parameter("rad", present, 0.0, high, 0.5 * one, 0.1 * one, (0.5 * one,))}
 
 
-def _set_backlash(machine: Machine, joint: str, values: Values) -> Machine:
+def _set_sensor_backlash(machine: Machine, joint: str, values: Values) -> Machine:
     return _with_sensor_error(machine, joint, backlash=values["gap"])
 
 
 EFFECTS = (
-    Effect("joint_bending", "bending of a link across its sensed joint", "geometry", _sensed_joints,
+    Effect("joint_bending", "bending of a link across its sensed joint", "geometry", _undriven_sensed_joints,
            _bending_parameters, _set_bending),
-    Effect("sensor_misalignment", "a tilted coupling of a joint's sensor", "sensor", _sensed_joints,
-           _misalignment_parameters, _set_misalignment),
-    Effect("sensor_backlash", "backlash in the coupling of a joint's sensor", "sensor", _sensed_joints,
-           _backlash_parameters, _set_backlash),
+    Effect("sensor_misalignment", "a tilted coupling of a joint's sensor", "sensor", _undriven_sensed_joints,
+           _sensor_misalignment_parameters, _set_sensor_misalignment),
+    Effect("sensor_backlash", "backlash in the coupling of a joint's sensor", "sensor", _undriven_sensed_joints,
+           _sensor_backlash_parameters, _set_sensor_backlash),
 )  # fmt: skip

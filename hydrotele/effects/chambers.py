@@ -23,7 +23,7 @@ from hydrotele.terms.law import Term
 _MIN_BULK_MODULUS_PA = 1.0e7  # Pa, oil full of air: the smallest bulk modulus that a machine file may state
 
 
-def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _internal_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the leakage coefficient between a drive's chambers.
 
     Bounds and prior are proportional to the rated flow divided by the highest pressure. A good seal
@@ -63,22 +63,22 @@ def _hose_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     drive, cylinder = machine.axes[location].hydraulic_drive, machine.axes[location].cylinder
     assert machine.supply
     middle = 0.5 * cylinder.stroke if cylinder else 0.0
-    volume = drive.dead_volume + drive.areas[0] * middle
+    volume = drive.dead_volume + drive.effective_areas[0] * middle
     oil = volume / machine.supply.bulk_modulus
     present = drive.hose_compliance
     return {"compliance": Parameter("m^3/Pa", present, 0.0, present + 3 * oil, 0.3 * oil,
                                     0.05 * oil)}  # fmt: skip
 
 
-def _make_setter(field: str, parameter: str):
-    def apply(machine: Machine, location: str, values: Values) -> Machine:
+def _make_drive_field_setter(field: str, parameter: str):
+    def set_drive_field(machine: Machine, location: str, values: Values) -> Machine:
         path = f"axes.{location}.{drive_kind(machine, location)}.{field}"
         return with_value(machine, path, values[parameter])
 
-    return apply
+    return set_drive_field
 
 
-def _oil_location(machine: Machine) -> tuple[str, ...]:
+def _oil_effect_locations(machine: Machine) -> tuple[str, ...]:
     return ("all",) if machine.supply and machine.valve_axes else ()
 
 
@@ -116,7 +116,7 @@ def _set_entrained_air(machine: Machine, location: str, values: Values) -> Machi
 CHAMBER_EFFECTS = (
     Effect(
         "internal_leakage", "leakage between a drive's chambers that differs from the model",
-        "flow", hydraulic_axes, _leakage_parameters, _make_setter("leakage", "leakage"), "leakage",
+        "flow", hydraulic_axes, _internal_leakage_parameters, _make_drive_field_setter("leakage", "leakage"), "leakage",
     ),
     Effect(
         "tank_leakage",
@@ -125,15 +125,15 @@ CHAMBER_EFFECTS = (
     ),
     Effect(
         "hose_compliance", "expansion of the hoses with pressure", "flow", valve_axes, _hose_parameters,
-        _make_setter("hose_compliance", "compliance"),
+        _make_drive_field_setter("hose_compliance", "compliance"),
     ),
     Effect(
-        "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _oil_location,
+        "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _oil_effect_locations,
         _bulk_modulus_parameters, _set_bulk_modulus, "oil compliance",
     ),
     Effect(
         "entrained_air", "air in the oil, which makes it compliant at low pressure", "flow",
-        _oil_location, _entrained_air_parameters, _set_entrained_air, "oil compliance",
+        _oil_effect_locations, _entrained_air_parameters, _set_entrained_air, "oil compliance",
     ),
 )  # fmt: skip
 
@@ -141,7 +141,7 @@ CHAMBER_EFFECTS = (
 NAME = "orifice_leakage"
 
 
-def _root_relief_pressure(machine: Machine) -> float:
+def _sqrt_relief_pressure(machine: Machine) -> float:
     """Return the square root of the relief pressure [sqrt(Pa)].
 
     The parameter of turbulent leakage is the flow at this pressure; flow over root is the law's gain.
@@ -158,14 +158,14 @@ def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Pa
     valve = machine.axes[location].valve
     assert valve
     gain = term_parameter(machine, NAME, location, "flow_rod", "flow_gain", 0.0)
-    present, rated = gain * _root_relief_pressure(machine), valve.rated_flow
+    present, rated = gain * _sqrt_relief_pressure(machine), valve.rated_flow
     high = present + 0.5 * rated
     return {"flow": Parameter("m^3/s", present, 0.0, high, 0.05 * rated, 0.005 * rated)}
 
 
 def _set_orifice_leakage(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with turbulent leakage between the head and the rod chamber of a drive."""
-    valve, gain = machine.axes[location].valve, values["flow"] / _root_relief_pressure(machine)
+    valve, gain = machine.axes[location].valve, values["flow"] / _sqrt_relief_pressure(machine)
     assert valve
     numbers = {"smoothing": valve.smoothing}
     terms = [

@@ -76,7 +76,7 @@ def _set_offset(machine: Machine, location: str, values: Values) -> Machine:
     return with_terms(machine, NAME, [term] if offset else [], [location])
 
 
-def _proportional_axes(machine: Machine) -> tuple[str, ...]:
+def _axes_without_own_pump(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes for which an offset of the command can be simulated.
 
     Axes with an own pump are excluded, because at command 0 their switching valve is closed.
@@ -88,7 +88,7 @@ COMMAND_OFFSET = Effect(
     NAME,
     "an offset of the received command",
     "valve",
-    _proportional_axes,
+    _axes_without_own_pump,
     _offset_parameters,
     _set_offset,
 )

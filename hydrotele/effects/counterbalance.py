@@ -21,10 +21,10 @@ def _max_inlet_drop(machine: Machine, location: str) -> float:
     valve = machine.axes[location].valve
     assert valve and machine.supply
     most = machine.supply.relief_pressure
-    return min(valve.compensator_drop, most) if valve.compensator_drop else most
+    return min(valve.compensator_pressure_drop, most) if valve.compensator_pressure_drop else most
 
 
-def _regulation_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _compensator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the effect of a pressure compensator.
 
     The parameter is the fraction of the relief pressure that the compensator absorbs; 0 means no
@@ -37,7 +37,7 @@ def _regulation_parameters(machine: Machine, location: str) -> dict[str, Paramet
                                     start_values=(0.6, 0.95))}  # fmt: skip
 
 
-def _set_compensation(machine: Machine, location: str, values: Values) -> Machine:
+def _set_pressure_compensator(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with a pressure compensator in a valve.
 
     The drop across the inlet edge is limited to (1 - `regulation`) times the relief pressure. The inlet
@@ -62,7 +62,7 @@ def _set_compensation(machine: Machine, location: str, values: Values) -> Machin
 
 LOAD_COMPENSATION = Effect(
     "load_compensation", "a pressure compensator that makes a valve's flow independent of the load",
-    "valve", valve_axes, _regulation_parameters, _set_compensation,
+    "valve", valve_axes, _compensator_parameters, _set_pressure_compensator,
 )  # fmt: skip
 
 
@@ -75,7 +75,7 @@ def _installed_valve(machine: Machine, location: str) -> Counterbalance | None:
     return getattr(machine.axes[axis].load_holding, side)
 
 
-def _setting_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _counterbalance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of a counterbalance valve's setting; 0 means no valve.
 
     Valves are set to 1.3 times the load pressure, at most to the port relief pressure. With the
@@ -102,7 +102,7 @@ LOAD_HOLDING = Effect(
     "a counterbalance valve at a chamber",
     "valve",
     _chamber_locations,
-    _setting_parameters,
+    _counterbalance_parameters,
     _set_counterbalance,
 )
 

@@ -107,7 +107,7 @@ def cylinder_axes(machine: Machine) -> tuple[str, ...]:
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
 
 
-def linkage_axes(machine: Machine) -> tuple[str, ...]:
+def nonparallel_cylinder_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the cylinder axes whose length depends on the positions of the pins.
 
     These are all cylinder axes except those whose cylinder is parallel to the sliding joint that it
@@ -177,7 +177,7 @@ def max_drive_force(machine: Machine, axis: str) -> float:
     facts = machine.axes[axis]
     if facts.force:
         return abs(facts.force.gain) * facts.force.command_limit
-    return machine.max_feed_pressure(axis) * facts.hydraulic_drive.areas[0]
+    return machine.max_feed_pressure(axis) * facts.hydraulic_drive.effective_areas[0]
 
 
 def typical_speed(machine: Machine, axis: str) -> float:
@@ -187,7 +187,7 @@ def typical_speed(machine: Machine, axis: str) -> float:
     """
     facts = machine.axes[axis]
     if facts.is_hydraulic:
-        return facts.rated_flow / facts.hydraulic_drive.areas[0]
+        return facts.rated_flow / facts.hydraulic_drive.effective_areas[0]
     low, high = machine.joints[facts.joint].range or (-0.5, 0.5)
     return (high - low) / _FULL_TRAVEL_TIME_S
 
@@ -219,7 +219,7 @@ def outboard_child(machine: Machine, link: str) -> str | None:
     return max(children, key=lambda n: float(np.linalg.norm(machine.links[n].position)), default=None)
 
 
-def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
+def next_joint_or_tip_position(machine: Machine, link: str) -> np.ndarray | None:
     """Return the origin of the next link outwards (3,) [m], in the frame of the given link.
 
     For the link with the arm's tip it is the position of the tip; None if no link follows.
@@ -236,7 +236,7 @@ def link_size(machine: Machine, link: str) -> float:
     It is the larger of two distances from the link's joint: to the next joint (or the arm's tip), and
     to the centre of mass.
     """
-    point = outboard_point(machine, link)
+    point = next_joint_or_tip_position(machine, link)
     far = 0.0 if point is None else float(np.linalg.norm(point))
     return max(far, float(np.linalg.norm(machine.links[link].com)), 1.0e-3)
 

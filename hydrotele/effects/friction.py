@@ -40,7 +40,7 @@ def _make_friction_parameters(field: str, scale: float, high: float):
         high: largest increase as a fraction of the same force [1].
     """
 
-    def parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    def friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
         present = getattr(machine.axes[location].drive.friction, field)
         whole, unit = max_drive_force(machine, location), force_unit(machine, location)
         if field == "viscous":
@@ -51,7 +51,7 @@ def _make_friction_parameters(field: str, scale: float, high: float):
         return {field: Parameter(_UNITS.get(unit, unit), present, 0.0, present + high * whole,
                                  size, least)}  # fmt: skip
 
-    return parameters
+    return friction_parameters
 
 
 _UNITS = {"N/(m/s)": "N s/m", "N m/(rad/s)": "N m s/rad"}
@@ -207,7 +207,7 @@ def _presliding_axes(machine: Machine) -> tuple[str, ...]:
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
 
 
-def _compliance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _presliding_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the compliance of dry friction before sliding.
 
     The friction acts as a spring (bristles of seals and guides) up to breakaway; 0 means no spring.
@@ -232,7 +232,7 @@ def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
     Below 2 % of the smallest relevant compliance the friction gets no spring, as in the rigid model.
     """
     compliance = values["compliance"]
-    number = _compliance_parameters(machine, location)["compliance"]
+    number = _presliding_parameters(machine, location)["compliance"]
     if compliance == number.nominal:
         return machine
     stiffness = 1.0 / compliance if compliance >= _MIN_COMPLIANCE_RATIO * number.min_relevant_change else 0.0
@@ -245,7 +245,7 @@ def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
 PRESLIDING = Effect(
     "presliding", "dry friction that acts as a spring before sliding", "force",
     _presliding_axes,
-    _compliance_parameters, _set_presliding,
+    _presliding_parameters, _set_presliding,
 )  # fmt: skip
 
 EFFECTS = (*BASIC_FRICTION_EFFECTS, *NONUNIFORM_FRICTION_EFFECTS, PRESLIDING)

@@ -10,9 +10,9 @@ from hydrotele.effects.effect import (
     Values,
     hinge_axes,
     lateral_directions,
-    linkage_axes,
+    next_joint_or_tip_position,
+    nonparallel_cylinder_axes,
     outboard_child,
-    outboard_point,
     with_value,
 )
 from hydrotele.machine.machine import Machine
@@ -26,7 +26,7 @@ def _link_length_axes(machine: Machine) -> tuple[str, ...]:
     places = []
     for axis in hinge_axes(machine):
         joint = machine.axes[axis].joint
-        point = outboard_point(machine, machine.link_of(joint))
+        point = next_joint_or_tip_position(machine, machine.link_of(joint))
         if point is None or not point.any():
             continue
         along = abs(np.dot(machine.joints[joint].axis, point)) / np.linalg.norm(point)
@@ -40,7 +40,7 @@ def _link_length_parameters(machine: Machine, location: str) -> dict[str, Parame
 
     The smallest relevant change is a thousandth of the length, the accuracy of welded structures.
     """
-    point = outboard_point(machine, machine.link_of(machine.axes[location].joint))
+    point = next_joint_or_tip_position(machine, machine.link_of(machine.axes[location].joint))
     assert point is not None
     size = float(np.linalg.norm(point))
     return {"length": Parameter("m", 0.0, -0.1 * size, 0.1 * size, 0.01 * size, 0.001 * size)}
@@ -56,7 +56,7 @@ def _set_link_length(machine: Machine, location: str, values: Values) -> Machine
     """
     length = values["length"]
     name = machine.link_of(machine.axes[location].joint)
-    point = outboard_point(machine, name)
+    point = next_joint_or_tip_position(machine, name)
     if point is None or length == 0.0:
         return machine
     size = float(np.linalg.norm(point))
@@ -145,13 +145,13 @@ def _set_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
 
 PIN_OFFSET = Effect(
     "pin_offset", "position of a cylinder's base pin that differs from the model", "geometry",
-    linkage_axes,
+    nonparallel_cylinder_axes,
     _pin_offset_parameters,
     _set_pin_offset,
 )  # fmt: skip
 
 
-def _base_location(machine: Machine) -> tuple[str, ...]:
+def _base_tilt_locations(machine: Machine) -> tuple[str, ...]:
     return ("base",) if any(machine.gravity) else ()
 
 
@@ -185,7 +185,7 @@ BASE_TILT = Effect(
     "base_tilt",
     "tilt of the base",
     "force",
-    _base_location,
+    _base_tilt_locations,
     _base_tilt_parameters,
     _set_base_tilt,
 )

@@ -16,7 +16,7 @@ from hydrotele.machine.machine import Link, Machine
 _COORDINATES = "xyz"
 
 
-def _is_vertical(machine: Machine, axis: str) -> bool:
+def _is_vertical_base_axis(machine: Machine, axis: str) -> bool:
     """Return whether an axis of a link on the world is parallel to gravity (within 18 degrees).
 
     Weight then causes no torque about the axis.
@@ -37,7 +37,7 @@ def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     relevant offset is six times larger.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
-    least = (0.03 if _is_vertical(machine, location) else 0.005) * size
+    least = (0.03 if _is_vertical_base_axis(machine, location) else 0.005) * size
     number = Parameter("m", 0.0, -0.3 * size, 0.3 * size, max(0.05 * size, 2 * least), least)
     axis = np.abs(machine.joints[machine.axes[location].joint].axis)
     return {name: number for k, name in enumerate(_COORDINATES) if k != int(np.argmax(axis))}
@@ -85,7 +85,7 @@ _MIN_PAYLOAD_KG = 1.0e-3  # kg: a smaller payload is omitted, since MuJoCo accep
 _GYRATION_RADIUS_M = 1.0e-3  # m, radius of gyration of a point mass, since MuJoCo needs some inertia
 
 
-def _tool_location(machine: Machine) -> tuple[str, ...]:
+def _payload_locations(machine: Machine) -> tuple[str, ...]:
     return ("tool",) if machine.arm else ()
 
 
@@ -118,7 +118,7 @@ TIP_PAYLOAD = Effect(
     "payload",
     "a point mass at the arm's tip",
     "force",
-    _tool_location,
+    _payload_locations,
     _payload_parameters,
     _set_payload,
 )

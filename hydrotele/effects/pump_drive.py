@@ -21,24 +21,24 @@ def _pump_motor_axes(machine: Machine) -> tuple[str, ...]:
     return tuple(n for n in _pump_axes(machine) if (p := machine.axes[n].pump) and p.motor)
 
 
-def _relief_load_axes(machine: Machine) -> tuple[str, ...]:
+def _axes_with_load_relief_valve(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes that push against a load cylinder with a relief valve."""
     return tuple(n for n in machine.loads if machine.loads[n].relief_pressure > 0.0)
 
 
-def _pump(machine: Machine, axis: str):
+def _get_axis_pump(machine: Machine, axis: str):
     pump = machine.axes[axis].pump
     assert pump
     return pump
 
 
-def _motor(machine: Machine, axis: str):
-    motor = _pump(machine, axis).motor
+def _get_pump_motor(machine: Machine, axis: str):
+    motor = _get_axis_pump(machine, axis).motor
     assert motor
     return motor
 
 
-def _ratio_parameter(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
+def _proportional_parameter(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
     """Return a positive parameter whose bounds and prior are proportional to its nominal value.
 
     Args:
@@ -57,16 +57,16 @@ def _displacement_parameters(machine: Machine, location: str) -> dict[str, Param
 
     Gear pumps of one size scatter by some per cent; a flow meter resolves 1 %.
     """
-    present = _pump(machine, location).displacement
-    return {"displacement": _ratio_parameter("m^3/rad", present, 0.1, 0.01, 3.0)}
+    present = _get_axis_pump(machine, location).displacement
+    return {"displacement": _proportional_parameter("m^3/rad", present, 0.1, 0.01, 3.0)}
 
 
-def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pump_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the leakage coefficient of an axis pump.
 
     They are fractions of the rated flow over the highest pressure: 10 % is typical, 1 % detectable.
     """
-    pump = _pump(machine, location)
+    pump = _get_axis_pump(machine, location)
     whole = pump.rated_flow / machine.max_feed_pressure(location)
     high = pump.leakage + 0.5 * whole
     numbers = "m^3/(s Pa)", pump.leakage, 0.0, high, 0.1 * whole, 0.01 * whole
@@ -78,7 +78,7 @@ def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parame
 
     Small gear pumps lose 10 to 60 % of their torque; warm oil changes the loss by 3 %.
     """
-    present = _pump(machine, location).torque_loss
+    present = _get_axis_pump(machine, location).torque_loss
     return {"torque_loss": Parameter("1", present, 0.0, max(2.0, present), 0.2, 0.03)}
 
 
@@ -87,30 +87,30 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
 
     Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
     """
-    present = _motor(machine, location).torque_constant
-    return {"torque_constant": _ratio_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
+    present = _get_pump_motor(machine, location).torque_constant
+    return {"torque_constant": _proportional_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
 
 
-def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _motor_inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the common inertia of motor and pump.
 
     It is known to tens of per cent; a wrong unit causes errors of powers of ten.
     """
-    present = _motor(machine, location).inertia
-    return {"inertia": _ratio_parameter("kg m^2", present, 0.3, 0.05, 30.0)}
+    present = _get_pump_motor(machine, location).inertia
+    return {"inertia": _proportional_parameter("kg m^2", present, 0.3, 0.05, 30.0)}
 
 
 def _stall_torque(machine: Machine, location: str) -> float:
-    motor = _motor(machine, location)
+    motor = _get_pump_motor(machine, location)
     return motor.torque_constant * motor.voltage / motor.resistance
 
 
-def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of dry drag and breakaway torque of motor and pump.
 
     They are fractions of the stall torque, of which brushes and seals cause 5 %.
     """
-    motor, whole = _motor(machine, location), _stall_torque(machine, location)
+    motor, whole = _get_pump_motor(machine, location), _stall_torque(machine, location)
     return {
         name: Parameter("N m", present, 0.0, present + 0.5 * whole, 0.05 * whole, 0.01 * whole)
         for name, present in (("drag", motor.drag), ("breakaway", motor.breakaway))
@@ -122,8 +122,8 @@ def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Param
 
     They are the same fractions as for dry drag, here of stall torque over rated speed.
     """
-    present = _motor(machine, location).viscous
-    whole = _stall_torque(machine, location) / _pump(machine, location).rated_speed
+    present = _get_pump_motor(machine, location).viscous
+    whole = _stall_torque(machine, location) / _get_axis_pump(machine, location).rated_speed
     sizes = 0.0, present + 0.5 * whole, 0.05 * whole, 0.01 * whole
     return {"viscous": Parameter("N m s/rad", present, *sizes)}
 
@@ -140,9 +140,9 @@ def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     volume are typical.
     """
     axis, _, side = location.partition(".")
-    drive, pump = machine.axes[axis].cylinder, _pump(machine, axis)
+    drive, pump = machine.axes[axis].cylinder, _get_axis_pump(machine, axis)
     assert drive
-    volume = drive.dead_volume + 0.5 * drive.stroke * drive.areas[_SIDES.index(side)]
+    volume = drive.dead_volume + 0.5 * drive.stroke * drive.effective_areas[_SIDES.index(side)]
     oil = volume / pump.bulk_modulus
     walls, air = getattr(pump, f"compliance_{side}"), getattr(pump, f"air_{side}")
     return {
@@ -163,8 +163,8 @@ def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parame
 
     It is set manually to tens of per cent; the finest mark of a gauge is 2 %.
     """
-    present = _pump(machine, location).accumulator.pressure
-    return {"pressure": _ratio_parameter("Pa", present, 0.2, 0.02, 5.0)}
+    present = _get_axis_pump(machine, location).accumulator.pressure
+    return {"pressure": _proportional_parameter("Pa", present, 0.2, 0.02, 5.0)}
 
 
 def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -186,30 +186,30 @@ def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Para
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}
 
 
-def _make_setter(part: str):
-    def apply(machine: Machine, location: str, values: Values) -> Machine:
+def _make_parameter_setter(part: str):
+    def set_parameters(machine: Machine, location: str, values: Values) -> Machine:
         for name, value in values.items():
             machine = with_value(machine, part.format(location) + "." + name, value)
         return machine
 
-    return apply
+    return set_parameters
 
 
-_set_pump, _set_motor = _make_setter("axes.{}.pump"), _make_setter("axes.{}.pump.motor")
-_set_accumulator, _set_load = _make_setter("axes.{}.pump.accumulator"), _make_setter("loads.{}")
+_set_pump, _set_motor = _make_parameter_setter("axes.{}.pump"), _make_parameter_setter("axes.{}.pump.motor")
+_set_accumulator, _set_load = _make_parameter_setter("axes.{}.pump.accumulator"), _make_parameter_setter("loads.{}")
 EFFECTS = (
     Effect("pump_displacement", "displacement of an axis pump that differs from the model", "flow",
            _pump_axes, _displacement_parameters, _set_pump),
     Effect("pump_leakage", "leakage of an axis pump that differs from the model", "flow", _pump_axes,
-           _leakage_parameters, _set_pump),
+           _pump_leakage_parameters, _set_pump),
     Effect("pump_torque_loss", "torque loss of an axis pump that differs from the model", "flow",
            _pump_motor_axes, _torque_loss_parameters, _set_pump),
     Effect("motor_constant", "torque constant of a pump motor that differs from the model", "flow",
            _pump_motor_axes, _motor_constant_parameters, _set_motor),
     Effect("motor_inertia", "inertia of pump and motor that differs from the model", "flow",
-           _pump_motor_axes, _inertia_parameters, _set_motor),
+           _pump_motor_axes, _motor_inertia_parameters, _set_motor),
     Effect("motor_drag", "dry drag of pump and motor that differs from the model", "flow", _pump_motor_axes,
-           _drag_parameters, _set_motor),
+           _motor_drag_parameters, _set_motor),
     Effect("motor_viscous_drag", "viscous drag of pump and motor that differs from the model",
            "flow", _pump_motor_axes, _viscous_drag_parameters, _set_motor),
     Effect("line_compliance", "compliance of, or air in, the lines between pump and cylinder",
@@ -217,7 +217,7 @@ EFFECTS = (
     Effect("accumulator_pressure", "accumulator charge pressure that differs from the model",
            "flow", _pump_axes, _accumulator_parameters, _set_accumulator),
     Effect("load_relief", "relief pressure of a load cylinder that differs from the model", "force",
-           _relief_load_axes, _load_relief_parameters, _set_load),
+           _axes_with_load_relief_valve, _load_relief_parameters, _set_load),
     Effect("load_friction", "packing friction of a load cylinder that differs from the model",
-           "force", _relief_load_axes, _load_friction_parameters, _set_load),
+           "force", _axes_with_load_relief_valve, _load_friction_parameters, _set_load),
 )  # fmt: skip

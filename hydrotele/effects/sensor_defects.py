@@ -8,7 +8,7 @@ from hydrotele.effects.effect import (
     Values,
     all_axes,
     hydraulic_axes,
-    linkage_axes,
+    nonparallel_cylinder_axes,
 )
 from hydrotele.machine.machine import Machine, SensorError
 
@@ -49,11 +49,11 @@ def _angle_offset_parameters(machine: Machine, location: str) -> dict[str, Param
     return {"offset": Parameter(unit, present, *sizes)}
 
 
-def _make_position_setter(field: str, parameter: str):
-    def apply(machine: Machine, location: str, values: Values) -> Machine:
+def _make_position_error_setter(field: str, parameter: str):
+    def set_position_error(machine: Machine, location: str, values: Values) -> Machine:
         return _with_sensor_error(machine, _position_channel(machine, location), **{field: values[parameter]})
 
-    return apply
+    return set_position_error
 
 
 def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -93,7 +93,7 @@ def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parame
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
 
 
-def _delay_parameters(present: float) -> dict[str, Parameter]:
+def _sensor_delay_parameters(present: float) -> dict[str, Parameter]:
     """Return nominal value (`present` [s]), bounds and prior of a sensor delay.
 
     Filters and buses delay by about 10 ms; 3 ms is one bus cycle.
@@ -103,10 +103,10 @@ def _delay_parameters(present: float) -> dict[str, Parameter]:
 
 
 def _angle_delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _delay_parameters(_sensor_error(machine, _position_channel(machine, location)).delay)
+    return _sensor_delay_parameters(_sensor_error(machine, _position_channel(machine, location)).delay)
 
 
-def _lag_parameters(present: float) -> dict[str, Parameter]:
+def _sensor_lag_parameters(present: float) -> dict[str, Parameter]:
     """Return nominal value (`present` [s]), bounds and prior of the first-order time constant of a sensor.
 
     Transducers and their filters have 1 to 50 ms.
@@ -116,7 +116,7 @@ def _lag_parameters(present: float) -> dict[str, Parameter]:
 
 
 def _angle_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _lag_parameters(_sensor_error(machine, _position_channel(machine, location)).time_constant)
+    return _sensor_lag_parameters(_sensor_error(machine, _position_channel(machine, location)).time_constant)
 
 
 def _length_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -140,7 +140,7 @@ def _transducer_locations(machine: Machine) -> tuple[str, ...]:
     return tuple(f"{axis}.{side}" for axis in machine.hydraulic_axes for side in _SIDES)
 
 
-def _transducer_channel(location: str) -> str:
+def _pressure_channel_of_location(location: str) -> str:
     axis, _, side = location.rpartition(".")
     return f"pressure_{side}.{axis}"
 
@@ -150,14 +150,14 @@ def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Pa
 
     The accuracy class is 0.5 % of the span, the repeatability better than 0.1 %.
     """
-    present = _sensor_error(machine, _transducer_channel(location)).offset
+    present = _sensor_error(machine, _pressure_channel_of_location(location)).offset
     span = machine.max_feed_pressure(location.rpartition(".")[0])
     low, high = present - 0.05 * span, present + 0.05 * span
     return {"offset": Parameter("Pa", present, low, high, 0.005 * span, 20.0e3 / 28.0e6 * span)}
 
 
 def _set_pressure_offset(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_sensor_error(machine, _transducer_channel(location), offset=values["offset"])
+    return _with_sensor_error(machine, _pressure_channel_of_location(location), offset=values["offset"])
 
 
 def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -166,20 +166,20 @@ def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Par
     It is wrong with a wrong span setting or supply voltage. A calibrated transducer is accurate to
     0.25 %.
     """
-    present = _sensor_error(machine, _transducer_channel(location)).scale
+    present = _sensor_error(machine, _pressure_channel_of_location(location)).scale
     low, high = min(0.8, present), max(1.2, present)
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
 
 
 def _set_pressure_scale(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_sensor_error(machine, _transducer_channel(location), scale=values["ratio"])
+    return _with_sensor_error(machine, _pressure_channel_of_location(location), scale=values["ratio"])
 
 
-def _transducer_channels(axis: str) -> tuple[str, ...]:
+def _pressure_channels_of_axis(axis: str) -> tuple[str, ...]:
     return tuple(f"pressure_{side}.{axis}" for side in _SIDES)
 
 
-def _common_value(machine: Machine, channels: tuple[str, ...], field: str) -> float:
+def _common_delay_or_lag(machine: Machine, channels: tuple[str, ...], field: str) -> float:
     """Return the smallest delay or time constant of several sensor channels [s].
 
     It counts as the part that all of them have in common.
@@ -192,12 +192,12 @@ def _common_value(machine: Machine, channels: tuple[str, ...], field: str) -> fl
     return min(getattr(_sensor_error(machine, channel), field) for channel in channels)
 
 
-def _with_common_value(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
+def _with_common_delay_or_lag(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
     """Return the machine with another common delay or time constant of several sensor channels.
 
     The smallest one becomes `value` [s], and all others change by the same time, but not below 0.
     """
-    more = value - _common_value(machine, channels, field)
+    more = value - _common_delay_or_lag(machine, channels, field)
     for channel in channels:
         shifted = getattr(_sensor_error(machine, channel), field) + more
         machine = _with_sensor_error(machine, channel, **{field: max(0.0, shifted)})
@@ -205,19 +205,21 @@ def _with_common_value(machine: Machine, channels: tuple[str, ...], field: str, 
 
 
 def _pressure_delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _delay_parameters(_common_value(machine, _transducer_channels(location), "delay"))
+    return _sensor_delay_parameters(_common_delay_or_lag(machine, _pressure_channels_of_axis(location), "delay"))
 
 
 def _set_pressure_delay(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common_value(machine, _transducer_channels(location), "delay", values["delay"])
+    return _with_common_delay_or_lag(machine, _pressure_channels_of_axis(location), "delay", values["delay"])
 
 
 def _pressure_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _lag_parameters(_common_value(machine, _transducer_channels(location), "time_constant"))
+    return _sensor_lag_parameters(_common_delay_or_lag(machine, _pressure_channels_of_axis(location), "time_constant"))
 
 
 def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common_value(machine, _transducer_channels(location), "time_constant", values["time_constant"])
+    return _with_common_delay_or_lag(
+        machine, _pressure_channels_of_axis(location), "time_constant", values["time_constant"]
+    )
 
 
 def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
@@ -243,19 +245,19 @@ def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Param
     response before its command. Between the two groups either sign is possible, as an offset of one or
     the other. Loggers are off by about 10 ms.
     """
-    present = _common_value(machine, _clock_groups(machine)[location], "delay")
+    present = _common_delay_or_lag(machine, _clock_groups(machine)[location], "delay")
     high = max(0.5, present)
     return {"offset": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.02, 0.1))}
 
 
 def _set_clock_offset(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common_value(machine, _clock_groups(machine)[location], "delay", values["offset"])
+    return _with_common_delay_or_lag(machine, _clock_groups(machine)[location], "delay", values["offset"])
 
 
 EFFECTS = (
     Effect(
         "angle_offset", "an offset of a position sensor", "sensor", all_axes, _angle_offset_parameters,
-        _make_position_setter("offset", "offset"),
+        _make_position_error_setter("offset", "offset"),
     ),
     Effect(
         "angle_drift", "an offset of a position sensor that drifts during warm-up", "sensor", all_axes,
@@ -263,18 +265,18 @@ EFFECTS = (
     ),
     Effect(
         "angle_scale", "a scale error of a position sensor", "sensor", all_axes, _angle_scale_parameters,
-        _make_position_setter("scale", "ratio"),
+        _make_position_error_setter("scale", "ratio"),
     ),
     Effect(
         "angle_delay", "a delay of a position sensor", "sensor", all_axes, _angle_delay_parameters,
-        _make_position_setter("delay", "delay"), "position sensor delay",
+        _make_position_error_setter("delay", "delay"), "position sensor delay",
     ),
     Effect(
         "angle_lag", "a first-order lag of a position sensor", "sensor", all_axes, _angle_lag_parameters,
-        _make_position_setter("time_constant", "time_constant"), "position sensor delay",
+        _make_position_error_setter("time_constant", "time_constant"), "position sensor delay",
     ),
     Effect(
-        "length_offset", "an offset of a cylinder's length sensor", "sensor", linkage_axes,
+        "length_offset", "an offset of a cylinder's length sensor", "sensor", nonparallel_cylinder_axes,
         _length_offset_parameters, _set_length_offset,
     ),
     Effect(

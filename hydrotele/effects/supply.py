@@ -4,17 +4,17 @@ from hydrotele.effects.effect import Effect, Parameter, Values, with_value
 from hydrotele.machine.machine import Machine
 
 
-def _supply_location(machine: Machine) -> tuple[str, ...]:
+def _supply_effect_locations(machine: Machine) -> tuple[str, ...]:
     return ("supply",) if machine.supply and machine.valve_axes else ()
 
 
-def _limited_flow_location(machine: Machine) -> tuple[str, ...]:
+def _limited_flow_locations(machine: Machine) -> tuple[str, ...]:
     """Return the location ("supply",), or () for machines whose pump does not limit the flow.
 
     A supply of constant pressure has no such limit.
     """
     supply = machine.supply
-    return _supply_location(machine) if supply and supply.kind != "constant_pressure" else ()
+    return _supply_effect_locations(machine) if supply and supply.kind != "constant_pressure" else ()
 
 
 def _pump_flow_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -44,7 +44,7 @@ def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
     return with_value(machine, "supply.pump_droop", values["droop"])
 
 
-def _lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pump_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the first-order time constant of the pump flow.
 
     Swash plates respond in 50 to 300 ms, fast ones in 20 ms.
@@ -83,19 +83,19 @@ def _set_supply(machine: Machine, location: str, values: Values) -> Machine:
 
 EFFECTS = (
     Effect(
-        "pump_flow_limit", "pump flow that differs from the model", "supply", _limited_flow_location,
+        "pump_flow_limit", "pump flow that differs from the model", "supply", _limited_flow_locations,
         _pump_flow_parameters, _set_supply
     ),
     Effect(
-        "pump_droop", "pump flow that decreases with pressure", "supply", _limited_flow_location, _droop_parameters,
+        "pump_droop", "pump flow that decreases with pressure", "supply", _limited_flow_locations, _droop_parameters,
         _set_droop,
     ),
     Effect(
-        "pump_lag", "pump flow that follows the demand with a lag", "supply", _limited_flow_location, _lag_parameters,
-        _set_supply
+        "pump_lag", "pump flow that follows the demand with a lag", "supply", _limited_flow_locations,
+        _pump_lag_parameters,         _set_supply
     ),
     Effect(
         "relief_pressure", "setting of the main relief valve that differs from the model", "supply",
-        _supply_location, _relief_parameters, _set_supply,
+        _supply_effect_locations, _relief_parameters, _set_supply,
     ),
 )  # fmt: skip

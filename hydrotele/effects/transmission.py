@@ -27,7 +27,7 @@ _MAX_FREQUENCY_RAD_S = 2.0 * math.pi * 150.0  # rad/s, drive on spring and oil: 
 _DEFAULT_DAMPING_RATIO = 0.3  # damping ratio of the drive on its spring: oil and friction of the teeth
 
 
-def rigid_transmission(machine: Machine, axis: str) -> Transmission:
+def make_stiff_transmission(machine: Machine, axis: str) -> Transmission:
     """Return a nearly rigid transmission of a drive, to which backlash or compliance can be added.
 
     Its drive-side inertia is the rod's mass, or for a motor 3 % of the load inertia in the home pose.
@@ -54,7 +54,7 @@ def spring_damping(inertia: float, stiffness: float) -> float:
     return 2.0 * _DEFAULT_DAMPING_RATIO * math.sqrt(stiffness * inertia)
 
 
-def min_resolvable_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
+def raise_to_resolvable_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
     """Return the drive-side inertia, increased if steps of 1 ms could not resolve its vibration.
 
     The result is at least (spring + oil stiffness) / w^2 with w = 2 pi 150 rad/s.
@@ -86,7 +86,7 @@ def _oil_stiffness(machine: Machine, axis: str) -> float:
     """
     drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
     assert machine.supply
-    head, rod = drive.areas
+    head, rod = drive.effective_areas
     far = drive.dead_volume + (rod * cylinder.stroke if cylinder else 0.0)
     return machine.supply.bulk_modulus * (head**2 / drive.dead_volume + rod**2 / far)
 
@@ -172,17 +172,17 @@ def _backlash_parameters(machine: Machine, location: str) -> dict[str, Parameter
     only to a factor; they matter only for chatter resolved sample by sample. Steel teeth vibrate at 30
     to 100 Hz. Faster contact of oil and teeth cannot be simulated with 1 ms steps.
     """
-    drive = _current_transmission(machine, location)
+    drive = _transmission_or_default(machine, location)
     present, rings = drive.backlash, _spring_frequency(drive)
     return {
         "gap": Parameter("rad", present, 0.0, max(0.05, present), 0.01, 1e-3, start_values=(0.003, 0.01, 0.03)),
-        "drive_inertia": _inertia_parameter("kg m^2", drive.inertia),
+        "drive_inertia": _drive_inertia_parameter("kg m^2", drive.inertia),
         "damping_ratio": _damping_ratio_parameter(drive),
         "contact_frequency": Parameter("Hz", rings, min(10.0, rings), max(110.0, rings), 20.0, 20.0, optional=True),
     }
 
 
-def _inertia_parameter(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
+def _drive_inertia_parameter(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
     """Return nominal value, bounds and prior of the drive-side inertia, an optional parameter.
 
     It is known only to a factor and does not indicate a defect.
@@ -207,8 +207,8 @@ def _spring_frequency(drive: Transmission) -> float:
     return math.sqrt(drive.stiffness / drive.inertia) / (2.0 * math.pi)
 
 
-def _current_transmission(machine: Machine, location: str) -> Transmission:
-    return machine.axes[location].transmission or rigid_transmission(machine, location)
+def _transmission_or_default(machine: Machine, location: str) -> Transmission:
+    return machine.axes[location].transmission or make_stiff_transmission(machine, location)
 
 
 def _transmission_damping_ratio(drive: Transmission) -> float:
@@ -223,7 +223,7 @@ def _set_backlash(machine: Machine, location: str, values: Values) -> Machine:
     gap, before = values["gap"], machine.axes[location].transmission
     if gap < _MIN_BACKLASH_RAD and before is None:
         return machine
-    drive = _current_transmission(machine, location)
+    drive = _transmission_or_default(machine, location)
     inertia = values.get("drive_inertia", drive.inertia)
     ratio, rings = (
         values.get("damping_ratio", _transmission_damping_ratio(drive)),
@@ -267,8 +267,8 @@ def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parame
     usual = _typical_deflection(machine, location) / max_drive_force(machine, location)
     transmission = machine.axes[location].transmission
     present = 1.0 / transmission.stiffness if transmission else 0.0
-    drive = transmission or rigid_transmission(machine, location)
-    resolved = [min_resolvable_inertia(machine, location, 0.0, k) for k in (0.0, 1.0 / usual)]
+    drive = transmission or make_stiff_transmission(machine, location)
+    resolved = [raise_to_resolvable_inertia(machine, location, 0.0, k) for k in (0.0, 1.0 / usual)]
     inertia = drive.inertia if transmission else max(drive.inertia, resolved[0])
     high = max(4.0 * usual, present)
     starts = (0.3 * usual, 1.0 * usual, 3.0 * usual)
@@ -277,7 +277,7 @@ def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parame
     unit, of_inertia = ("rad/(N m)", "kg m^2") if turns else ("m/N", "kg")
     return {
         "compliance": Parameter(unit, present, 0.0, high, usual, least, starts),
-        "drive_inertia": _inertia_parameter(of_inertia, inertia, *resolved),
+        "drive_inertia": _drive_inertia_parameter(of_inertia, inertia, *resolved),
         "damping_ratio": _damping_ratio_parameter(drive),
     }
 
@@ -295,10 +295,10 @@ def _set_flexibility(machine: Machine, location: str, values: Values) -> Machine
     unlike = [key for key in table if key in values and values[key] != table[key].nominal]
     if not unlike or (before is None and compliance < least):
         return machine
-    transmission = before or rigid_transmission(machine, location)
+    transmission = before or make_stiff_transmission(machine, location)
     stiffness = 1.0 / max(compliance, least) if "compliance" in unlike else transmission.stiffness
     inertia = values.get("drive_inertia", transmission.inertia)
-    inertia = min_resolvable_inertia(machine, location, inertia, stiffness)
+    inertia = raise_to_resolvable_inertia(machine, location, inertia, stiffness)
     ratio = values.get("damping_ratio", _transmission_damping_ratio(transmission))
     damping = 2.0 * ratio * math.sqrt(stiffness * inertia)
     soft = {"stiffness": stiffness, "inertia": inertia, "damping": damping}

@@ -12,7 +12,7 @@ from hydrotele.machine.drives import FlowCurve, Metering, Valve
 from hydrotele.machine.machine import Machine
 
 
-def _valve(machine: Machine, location: str) -> Valve:
+def _get_axis_valve(machine: Machine, location: str) -> Valve:
     valve = machine.axes[location].valve
     assert valve
     return valve
@@ -23,7 +23,7 @@ def _common_deadband_axes(machine: Machine) -> tuple[str, ...]:
     return tuple(
         name for name in valve_axes(machine)
         if any(way.deadband is None
-               for way in (_valve(machine, name).positive, _valve(machine, name).negative))
+               for way in (_get_axis_valve(machine, name).positive, _get_axis_valve(machine, name).negative))
     )  # fmt: skip
 
 
@@ -33,7 +33,7 @@ def _deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter
     The deadband is the fraction of the spool's stroke without flow, a few per cent. The smallest
     relevant change is 0.4 %, the typical hysteresis of a spool.
     """
-    present = _valve(machine, location).deadband
+    present = _get_axis_valve(machine, location).deadband
     return {"deadband": Parameter("1", present, 0.0, max(0.3, present), 0.03, 0.004)}
 
 
@@ -51,7 +51,7 @@ def _gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
-    flow = _valve(machine, location).rated_flow * values["ratio"]
+    flow = _get_axis_valve(machine, location).rated_flow * values["ratio"]
     return with_value(machine, f"axes.{location}.valve.rated_flow", flow)
 
 
@@ -61,7 +61,7 @@ def _bandwidth_parameters(machine: Machine, location: str) -> dict[str, Paramete
     The smallest relevant deviation is 8 %. At 8 Hz it changes the lag by 3 ms, the smallest
     relevant delay.
     """
-    w = _valve(machine, location).bandwidth
+    w = _get_axis_valve(machine, location).bandwidth
     return {"bandwidth": Parameter("rad/s", w, 0.1 * w, 4.0 * w, 0.4 * w, 0.08 * w)}
 
 
@@ -112,7 +112,7 @@ def _direction_gain_parameters(machine: Machine, location: str) -> dict[str, Par
 
 def _scale_direction_gains(machine: Machine, location: str, values: Values) -> Machine:
     for direction in DIRECTIONS:
-        present = getattr(_valve(machine, location), direction)
+        present = getattr(_get_axis_valve(machine, location), direction)
         for edge in ("inlet", "outlet"):
             path = f"axes.{location}.valve.{direction}.{edge}"
             machine = with_value(machine, path, getattr(present, edge) * values[direction])
@@ -124,7 +124,7 @@ def _direction_deadband_parameters(machine: Machine, location: str) -> dict[str,
 
     The bounds are wider than for a common deadband, because a spool may rest off its centre.
     """
-    present = _valve(machine, location).deadbands
+    present = _get_axis_valve(machine, location).deadbands
     return {
         direction: Parameter("1", band, 0.0, max(0.6, band), 0.03, 0.004)
         for direction, band in zip(DIRECTIONS, present, strict=True)
@@ -132,7 +132,7 @@ def _direction_deadband_parameters(machine: Machine, location: str) -> dict[str,
 
 
 def _set_direction_deadbands(machine: Machine, location: str, values: Values) -> Machine:
-    present = _valve(machine, location).deadbands
+    present = _get_axis_valve(machine, location).deadbands
     for direction, band in zip(DIRECTIONS, present, strict=True):
         if values[direction] != band:
             path = f"axes.{location}.valve.{direction}.deadband"
@@ -155,7 +155,7 @@ DIRECTION_EFFECTS = (
 _CURVE_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
 
 
-def _progression_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _flow_curve_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (0), bounds and prior of the flow curve's progression for each direction.
 
     The progression says how much less a valve opens over its first travel than a linear one; see
@@ -165,7 +165,7 @@ def _progression_parameters(machine: Machine, location: str) -> dict[str, Parame
     return dict.fromkeys(DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
 
-def _set_progression(machine: Machine, location: str, values: Values) -> Machine:
+def _set_flow_curve(machine: Machine, location: str, values: Values) -> Machine:
     valve = machine.axes[location].valve
     assert valve
     for direction in DIRECTIONS:
@@ -195,8 +195,8 @@ def bend_flow_curve(present: Metering, progression: float) -> FlowCurve:
 
 
 FLOW_CURVE = Effect(
-    "flow_curve", "a nonlinear valve opening over the travel", "valve", valve_axes, _progression_parameters,
-    _set_progression
+    "flow_curve", "a nonlinear valve opening over the travel", "valve", valve_axes, _flow_curve_parameters,
+    _set_flow_curve
 )  # fmt: skip
 
 
@@ -207,7 +207,7 @@ EDGE_FIELDS = {
 """Metering edge -> field of the valve that holds its gain."""
 
 
-def _edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _metering_edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the relative gain of each metering edge of a valve.
 
     The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. Estimates:
@@ -224,7 +224,7 @@ def _edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     }
 
 
-def _set_edges(machine: Machine, location: str, values: Values) -> Machine:
+def _set_metering_edges(machine: Machine, location: str, values: Values) -> Machine:
     for edge, field in EDGE_FIELDS.items():
         machine = with_value(machine, f"axes.{location}.valve.{field}", values[edge])
     return machine
@@ -232,7 +232,7 @@ def _set_edges(machine: Machine, location: str, values: Values) -> Machine:
 
 METERING_EDGES = Effect(
     "metering_edges", "areas of a valve's metering edges (P-A, B-T, P-B, A-T) that differ from the"
-    " model", "valve", valve_axes, _edge_parameters, _set_edges,
+    " model", "valve", valve_axes, _metering_edge_parameters, _set_metering_edges,
 )  # fmt: skip
 
 

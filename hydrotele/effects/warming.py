@@ -20,7 +20,7 @@ def _leakage_coefficients(machine: Machine) -> dict[str, float]:
     return {name: leakage for name, leakage in found.items() if leakage}
 
 
-def _oil_location(machine: Machine) -> tuple[str, ...]:
+def _warming_locations(machine: Machine) -> tuple[str, ...]:
     return (ALL_AXES,) if _viscous_friction(machine) or _leakage_coefficients(machine) else ()
 
 
@@ -65,6 +65,6 @@ def _set_warming(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    NAME, "warming oil, with less viscous friction and more leakage", "force", _oil_location, _warming_parameters,
+    NAME, "warming oil, with less viscous friction and more leakage", "force", _warming_locations, _warming_parameters,
     _set_warming,
 )  # fmt: skip

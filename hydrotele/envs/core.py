@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_axes
-from hydrotele.control.servo import tabulate_drives
+from hydrotele.control.servo import tabulate_drive_geometry
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import (
     EPISODE_STATE,
@@ -23,10 +23,10 @@ from hydrotele.envs.episode import (
     make_seed_states,
 )
 from hydrotele.envs.facts import TaskSetup, make_task_parameters, make_timing
-from hydrotele.envs.loop import advance
+from hydrotele.envs.loop import step_or_reset_simulation
 from hydrotele.envs.task import Options, Task
 from hydrotele.envs.variants import make_variants
-from hydrotele.envs.world import machine_fields
+from hydrotele.envs.world import list_machine_observation_fields
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.fleet import SimulationBatch
 from hydrotele.simulate.native import stop_profiling_clock
@@ -50,7 +50,7 @@ def check_count(name: str, count: int, least: int, most: int) -> None:
         raise InputError(name, f"must be a whole number from {least} to {most}, not {count!r}")
 
 
-def make_setup(task: Task, options: Options) -> TaskSetup:
+def make_task_setup(task: Task, options: Options) -> TaskSetup:
     """Combine a task with the user's options: load its machines, observation and clocks.
 
     Args:
@@ -72,8 +72,8 @@ def make_setup(task: Task, options: Options) -> TaskSetup:
     arm = arm_axes(machine)
     axes = (*arm, *task.extra_axes)
     variants = make_variants(task, options, machine)
-    fields = [*machine_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
-    table = tabulate_drives(machine, variants.plant.axes)[1]
+    fields = [*list_machine_observation_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
+    table = tabulate_drive_geometry(machine, variants.plant.axes)[1]
     return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 
 
@@ -115,14 +115,14 @@ class TaskCore:
         stop_profiling_clock()
         check_count("num_envs", count, 1, MAX_ENVIRONMENTS)
         check_count("threads", threads, 0, MAX_THREADS)
-        self.count, self.setup = int(count), make_setup(task, options)
+        self.count, self.setup = int(count), make_task_setup(task, options)
         self.simulations = SimulationBatch(self.setup.variants.plant.model, count, threads)
-        self._make_arrays()
+        self._allocate_arrays()
         self.parameters = make_task_parameters(self.setup, count, autoreset)
-        self._store_addresses()
+        self._store_array_addresses()
         self._is_started = np.zeros(count, bool)
 
-    def _make_arrays(self) -> None:
+    def _allocate_arrays(self) -> None:
         n, o, v = self.count, len(self.setup.fields), self.setup.variants
         self.episodes = np.zeros(n, EPISODE_STATE)
         self.action = np.zeros((n, len(self.setup.axes)), np.float32)
@@ -136,7 +136,7 @@ class TaskCore:
         self._commands = np.zeros((n, delay_line_length(v.command_delays, self.setup.clock.substeps), MAX_AXES))
         self._sensed = np.zeros((n, sensor_history_length(v.sensor_delays, v.lag_ratios), MAX_CHANNELS))
         self._sensed_before = np.zeros((n, MAX_CHANNELS))
-        self._expanded_fields = {name: self.simulations.expand_field(name) for name in v.fields}
+        self._expanded_fields = {name: self.simulations.expand_field_per_simulation(name) for name in v.fields}
         for name, live in self._expanded_fields.items():
             if live.shape[1] != v.fields[name].shape[1]:  # native code copies one into the other
                 message = f"variants cannot differ in {name}: the model has colliding meshes"
@@ -144,7 +144,7 @@ class TaskCore:
         same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
         self._actuator_parameters = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
-    def _store_addresses(self) -> None:
+    def _store_array_addresses(self) -> None:
         """Store the addresses of all arrays in the record that native code reads."""
         v, f = self.setup.variants, self.parameters
         f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
@@ -210,7 +210,7 @@ class TaskCore:
         self._is_started = begun
         self.parameters["call"] = RESET
         ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
-        self.simulations.apply(advance.address, self.parameters.ctypes.data, ids)
+        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data, ids)
 
     def step(self, action: np.ndarray) -> None:
         """Advance all episodes by one environment step.
@@ -233,7 +233,7 @@ class TaskCore:
             raise ValueError("all actions must be finite numbers")
         np.clip(values, -1.0, 1.0, out=self.action, casting="unsafe")  # large float64 numbers exceed float32
         self.parameters["call"] = STEP
-        self.simulations.apply(advance.address, self.parameters.ctypes.data)
+        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data)
 
     def step_single(self, action: np.ndarray) -> None:
         """Advance a single episode; like `step`, but the action must have shape (a,)."""
@@ -246,8 +246,8 @@ class TaskCore:
         """Return copies of the model and data of one simulation, after `mj_forward`."""
         model = copy.copy(self.setup.variants.plant.model)
         data = mujoco.MjData(model)
-        self.simulations.get_model(number, model)
-        self.simulations.get_data(number, data)
+        self.simulations.copy_model_into(number, model)
+        self.simulations.copy_data_into(number, data)
         mujoco.mj_forward(model, data)
         return model, data
 

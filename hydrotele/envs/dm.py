@@ -14,7 +14,7 @@ from dm_control.mujoco import engine, wrapper
 from dm_env import specs
 
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.making import make_core, make_info
+from hydrotele.envs.making import make_info, make_task_core
 from hydrotele.envs.stage import FREE_CAMERA, Camera, TaskRenderer
 from hydrotele.envs.world import ObservationField
 
@@ -63,14 +63,14 @@ class MachineEnvironment(dm_env.Environment):
         options: Mapping[str, Any],
     ) -> None:  # fmt: skip
         """Compile the machine; the arguments are those of `load`, `flat` is its `flat_observation`."""
-        self.core = make_core(task_name, dict(options), 1, 1, DISABLED)
+        self.core = make_task_core(task_name, dict(options), 1, 1, DISABLED)
         if random is None:
             random = int(np.random.default_rng().integers(2**62))
         elif isinstance(random, np.random.RandomState):
             random = int(random.randint(2**31 - 1))
         self._seed = random
         self._is_started, self._is_over = False, True
-        self._key_indices = group_indices(
+        self._key_indices = group_indices_by_key(
             [FLAT_KEY] * len(self.core.setup.fields) if flat else self._observation_keys()
         )
         self.fields: dict[str, tuple[ObservationField, ...]] = {
@@ -86,7 +86,7 @@ class MachineEnvironment(dm_env.Environment):
         """Start an episode; the first one uses the seed."""
         self.core.reset(None if self._is_started else np.array([self._seed]))
         self._is_started, self._is_over = True, False
-        return dm_env.restart(self._observation())
+        return dm_env.restart(self._grouped_observation())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Advance by one step, or start an episode if the last one is over.
@@ -104,13 +104,13 @@ class MachineEnvironment(dm_env.Environment):
             return self.reset()
         core = self.core
         core.step_single(action)
-        reward, seen = float(core.reward[0]), self._observation()
+        reward, seen = float(core.reward[0]), self._grouped_observation()
         self._is_over = bool(core.terminated[0] or core.truncated[0])
         if core.terminated[0]:
             return dm_env.termination(reward, seen)
         return dm_env.truncation(reward, seen) if self._is_over else dm_env.transition(reward, seen)
 
-    def _observation(self) -> collections.OrderedDict[str, np.ndarray]:
+    def _grouped_observation(self) -> collections.OrderedDict[str, np.ndarray]:
         return split_by_key(self.core.observation[0], self._key_indices)
 
     def observation_spec(self) -> collections.OrderedDict[str, specs.BoundedArray]:
@@ -150,9 +150,9 @@ class MachineEnvironment(dm_env.Environment):
         Raises:
             InputError: the camera does not exist, or OpenGL does not work.
         """
-        return self._get_stage().render(0, width, height, camera_id)
+        return self._get_renderer().render(0, width, height, camera_id)
 
-    def _get_stage(self) -> TaskRenderer:
+    def _get_renderer(self) -> TaskRenderer:
         if self._stage is None:
             self._stage = TaskRenderer(self.core)
         return self._stage
@@ -163,7 +163,7 @@ class MachineEnvironment(dm_env.Environment):
 
         Changes to it do not affect the simulation.
         """
-        stage = self._get_stage()
+        stage = self._get_renderer()
         if self._physics is None:
             self._physics = Physics.from_model(wrapper.MjModel(stage.model))
             self._physics.stage = stage
@@ -211,7 +211,7 @@ class Physics(engine.Physics):
         return self.stage.render(0, width, height, camera_id)
 
 
-def group_indices(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
+def group_indices_by_key(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
     """Return the indices of every distinct key in a list, in order of first occurrence."""
     places: collections.OrderedDict[str, list[int]] = collections.OrderedDict()
     for place, key in enumerate(keys):

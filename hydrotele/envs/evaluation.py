@@ -46,7 +46,7 @@ class Scores:
         return "\n".join(rows)
 
 
-def evaluate(core: TaskCore, controller: Controller, episodes: int, seed: int = 0) -> Scores:
+def evaluate_controller(core: TaskCore, controller: Controller, episodes: int, seed: int = 0) -> Scores:
     """Run a controller for complete episodes in batches.
 
     Every episode has the same weight, whatever its length.
@@ -69,12 +69,12 @@ def evaluate(core: TaskCore, controller: Controller, episodes: int, seed: int = 
     for first in range(0, max(1, episodes), core.count):
         core.reset(seed + first + np.arange(core.count))
         controller.begin(core.count)
-        parts.append(_run_batch(core, controller))
+        parts.append(_run_episode_batch(core, controller))
     figures = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return Scores(figures, {name: _find_unit(core, name) for name in figures})
+    return Scores(figures, {name: _find_result_unit(core, name) for name in figures})
 
 
-def _run_batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
+def _run_episode_batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
     """Run one batch of newly started episodes to their end and return the results."""
     n, names = core.count, [name for name, _ in core.setup.task.measures]
     total, steps = np.zeros(n), np.zeros(n)
@@ -103,13 +103,13 @@ def _run_batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
     return figures
 
 
-def _find_unit(core: TaskCore, name: str) -> str:
+def _find_result_unit(core: TaskCore, name: str) -> str:
     if name == "length":
         return "s"
     return dict(core.setup.task.measures).get(name.rpartition(" ")[0], "1")
 
 
-def compare_scores(scores: Sequence[tuple[str, Scores]], names: Sequence[str]) -> str:
+def tabulate_scores(scores: Sequence[tuple[str, Scores]], names: Sequence[str]) -> str:
     """Return a Markdown table of results, mean ± standard error, with one row per controller.
 
     `scores` holds (label, scores) of each controller; `names` selects the results of the columns.

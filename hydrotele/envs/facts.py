@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_specification
-from hydrotele.control.servo import servo_parameters, tabulate_drives
+from hydrotele.control.servo import servo_parameters, tabulate_drive_geometry
 from hydrotele.core.compiled import Callback
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
@@ -22,17 +22,17 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import (
     Machine,
     SensorSet,
-    channel_converter,
-    channel_sensor,
-    get_sensors,
+    find_channel_sensor,
+    get_sensor_set,
+    make_channel_converter,
 )
 from hydrotele.simulate.feedback import periods_per_sample
-from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
+from hydrotele.simulate.layout import field_offsets, function_address, verify_struct_offsets
 from hydrotele.simulate.mechanism import TIP_SITE
 
 TASK_CODES: dict[str, Callback] = {
-    "track": track.task_code, "line": line.task_code, "force": force.task_code, "reach": reach.task_code,
-    "grade": grade.task_code, "place": place.task_code,
+    "track": track.run_task_part, "line": line.run_task_part, "force": force.run_task_part,
+    "reach": reach.run_task_part, "grade": grade.run_task_part, "place": place.run_task_part,
 }  # fmt: skip
 """Kind of task -> its native code, see `world`."""
 
@@ -156,9 +156,9 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     if task.parameters:
         numbers = task.parameters(setup.machine, model)
         facts["parameters"][: len(numbers)] = numbers
-    _write_machine(facts, setup, columns)
-    _write_sensors(facts, setup)
-    _write_layout(facts)
+    _write_machine_parameters(facts, setup, columns)
+    _write_sensor_parameters(facts, setup)
+    _write_memory_layout(facts)
     return facts
 
 
@@ -179,10 +179,10 @@ def full_action_rate(machine: Machine, axis: str) -> float:
         return _FORCE_DRIVE_RATE
     arm = np.abs(axis_linkage(machine, axis).rate(np.linspace(low, high, 101))).max()
     flow = min(facts.valve.rated_flow, machine.supply.pump_flow)
-    return _FULL_RATE_FRACTION * flow / facts.hydraulic_drive.areas[0] / float(arm)
+    return _FULL_RATE_FRACTION * flow / facts.hydraulic_drive.effective_areas[0] / float(arm)
 
 
-def _write_machine(facts: np.ndarray, setup: TaskSetup, columns: list[int]) -> None:
+def _write_machine_parameters(facts: np.ndarray, setup: TaskSetup, columns: list[int]) -> None:
     plant, machine = setup.variants.plant, setup.machine
     k, servo = len(plant.axes), setup.task.servo
     facts["limit"][:k] = [drive.command_limit if (drive := machine.axes[name].force) else 1.0 for name in plant.axes]
@@ -195,11 +195,11 @@ def _write_machine(facts: np.ndarray, setup: TaskSetup, columns: list[int]) -> N
     facts["arm"] = arm_specification(machine)[0]
     facts["servo"][:k] = servo_parameters(machine, plant.axes, servo, setup.clock.period)
     facts["feedforward"] = servo.feedforward
-    facts["grid"][:k] = tabulate_drives(machine, plant.axes)[0]
+    facts["grid"][:k] = tabulate_drive_geometry(machine, plant.axes)[0]
     facts["table"] = setup.drive_table.ctypes.data
 
 
-def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
+def _write_sensor_parameters(facts: np.ndarray, setup: TaskSetup) -> None:
     plant, machine, clock = setup.variants.plant, setup.machine, setup.clock
     sensors: SensorSet | None
     if setup.options.sensors == REAL_SENSORS:
@@ -207,20 +207,20 @@ def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
             raise InputError("sensors 'real'", f"machine {machine.name} has no set of sensors")
         sensors = next(iter(machine.sensors.values()))
     else:
-        sensors = get_sensors(machine, setup.options.sensors)
+        sensors = get_sensor_set(machine, setup.options.sensors)
     facts["every"], facts["noisy"] = (
         periods_per_sample(1.0 / clock.period, sensors),
         sensors is not None,
     )
     for c, name in enumerate(sensor_channels(plant)):
-        kind = channel_sensor(machine, sensors, name)
+        kind = find_channel_sensor(machine, sensors, name)
         facts["accuracy"][c] = kind.accuracy or 3**0.5 * kind.standard_deviation  # of equal RMS
-        facts["converters"][:, c] = channel_converter(kind, name)
+        facts["converters"][:, c] = make_channel_converter(kind, name)
 
 
-def _write_layout(facts: np.ndarray) -> None:
+def _write_memory_layout(facts: np.ndarray) -> None:
     """Write the byte offsets of members of mjData and mjModel and the addresses of MuJoCo functions."""
-    verify_layout()
+    verify_struct_offsets()
     facts["mj_step"] = function_address("mj_step")
     facts["mj_set_state"] = function_address("mj_setState")
     data, model = field_offsets("mjData"), field_offsets("mjModel")

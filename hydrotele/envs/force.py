@@ -14,7 +14,7 @@ from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.memory import struct_field_view
 from hydrotele.envs.episode import draw_uniform_between
-from hydrotele.envs.task import Task, draw_start
+from hydrotele.envs.task import Task, sample_start_positions
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
@@ -22,13 +22,13 @@ from hydrotele.envs.world import (
     TASK_SIGNATURE,
     TICK,
     ObservationField,
-    episode_records,
+    episode_states_view,
     observation_view,
-    parameters_view,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Plate, Servo, SurroundingObject
 
@@ -48,8 +48,8 @@ _FIRST_FORCE, _SECOND_FORCE, _CHANGE_TIME, _TRUE_FORCE, MEASURED_FORCE, _PEAK_FO
 PLATE_QPOS, PLATE_DOF, PLATE_JOINT, CENTRE_X, CENTRE_Y, HALF_X, HALF_Y = range(7)
 
 
-def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_force` writes: measured and reference force, time."""
+def list_force_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_force_observation` writes: measured and reference force, time."""
     return [
         ObservationField("force", "N", -_CELL_RANGE, _CELL_RANGE),
         ObservationField("reference_force", "N", 0.0, MAX_FORCE),
@@ -58,7 +58,7 @@ def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
 
 
 @compiled
-def plate_force(f, w):
+def compute_plate_force(f, w):
     """Return the force that the spring and the damper under the plate carry, positive when it is pressed down.
 
     Args:
@@ -79,7 +79,7 @@ def plate_force(f, w):
 
 
 @compiled
-def begin_force(f, e, w):
+def draw_force_references(f, e, w):
     """Draw the goal of an episode: two reference forces, and the time of the change from one to the other.
 
     Args:
@@ -101,20 +101,20 @@ def begin_force(f, e, w):
     g[_SECOND_FORCE] = MIN_FORCE + place if place < below else g[_FIRST_FORCE] + _MIN_FORCE_CHANGE + (place - below)
     g[_CHANGE_TIME] = draw_uniform_between(e, _MIN_CHANGE_TIME, _MAX_CHANGE_TIME) * f.horizon * f.ticks * f.period
     g[_PEAK_FORCE] = 0.0
-    _sample_force(f, e, w)
+    _sample_load_cell(f, e, w)
 
 
 @compiled
-def _sample_force(f, e, w):
+def _sample_load_cell(f, e, w):
     """Update the true force, and sample the load cell if a sensor sample is due."""
-    e.goal[_TRUE_FORCE] = plate_force(f, w)
+    e.goal[_TRUE_FORCE] = compute_plate_force(f, w)
     if e.tick % f.every == 0:
         error = draw_uniform_between(e, -MAX_CELL_ERROR, MAX_CELL_ERROR) if f.noisy else 0.0
         e.goal[MEASURED_FORCE] = e.goal[_TRUE_FORCE] + error
 
 
 @compiled
-def update_force(f, e, w):
+def update_force_measurement(f, e, w):
     """Update the true force, the load cell reading and the maximum force of this step, after a control period.
 
     Args:
@@ -127,7 +127,7 @@ def update_force(f, e, w):
 
     Source: this module.
     """
-    _sample_force(f, e, w)
+    _sample_load_cell(f, e, w)
     e.goal[_PEAK_FORCE] = max(e.goal[_PEAK_FORCE], e.goal[_TRUE_FORCE])
 
 
@@ -150,7 +150,7 @@ def reference_force(g, time):
 
 
 @compiled
-def observe_force(f, e, out, at):
+def write_force_observation(f, e, out, at):
     """Write the measured force, the reference force and the time since its last change to the observation.
 
     Args:
@@ -162,14 +162,14 @@ def observe_force(f, e, out, at):
     Returns:
         Nothing.
 
-    Source: `force_fields`.
+    Source: `list_force_observation_fields`.
     """
     out[at] = e.goal[MEASURED_FORCE]
     out[at + 1], out[at + 2] = reference_force(e.goal, e.tick * f.period)
 
 
 @compiled
-def reward_force(f, e, w):
+def compute_force_reward(f, e, w):
     """Compute the reward from the true force; an overload or leaving the plate ends the episode.
 
     Args:
@@ -206,16 +206,16 @@ _DAMPING_RATIO = 0.87  # damping ratio, as of the plate of Zhu 1994's experiment
 _START_HEIGHTS = (0.05, 0.15)  # m, initial height of the tip above the plate
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw random arm positions with the bucket over the centre of the plate, teeth down."""
-    return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
+    return sample_start_positions(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
-def _make_plate(machine: Machine, rng: np.random.Generator, start: dict[str, float]) -> tuple[SurroundingObject, ...]:
+def _sample_plate(machine: Machine, rng: np.random.Generator, start: dict[str, float]) -> tuple[SurroundingObject, ...]:
     """Return a spring-mounted plate below the tip, with random stiffness and height."""
     numbers, axes, _ = arm_specification(machine)
     pose = np.zeros(5)
-    task_forward(numbers, np.array([start[name] for name in axes]), pose)
+    compute_tip_pose(numbers, np.array([start[name] for name in axes]), pose)
     stiffness = math.exp(rng.uniform(math.log(_MIN_STIFFNESS), math.log(_MAX_STIFFNESS)))
     height = float(pose[2] - rng.uniform(*_START_HEIGHTS))
     damping = 2.0 * _DAMPING_RATIO * math.sqrt(stiffness * _MASS)
@@ -223,7 +223,7 @@ def _make_plate(machine: Machine, rng: np.random.Generator, start: dict[str, flo
                   damping=damping),)  # fmt: skip
 
 
-def _make_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _make_plate_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Return the indices of the plate in the model, its centre and its half sizes."""
     joint = model.joint("plate_0")
     return (joint.qposadr[0], joint.dofadr[0], joint.id, *_CENTRE, *_HALF_SIZE)
@@ -245,11 +245,11 @@ HOLD_FORCE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=20.0,
-    start=_draw_start,
-    fields=force_fields,
+    start=_sample_start_positions,
+    fields=list_force_observation_fields,
     measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("off_plate", "1")),
-    surroundings=_make_plate,
-    parameters=_make_parameters,
+    surroundings=_sample_plate,
+    parameters=_make_plate_parameters,
     servo=Servo(position_gain=5.0),  # a higher gain lets the boom hammer on the plate
     pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as in the scenario `press_stiffness`
 )
@@ -257,20 +257,20 @@ HOLD_FORCE = Task(
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_force(f, e, w)
+        draw_force_references(f, e, w)
     elif part == TICK:
-        update_force(f, e, w)
+        update_force_measurement(f, e, w)
     elif part == OBSERVE:
-        observe_force(f, e, observation_view(f, out), 0)
+        write_force_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_force(f, e, w))
+        return store_episode_end(e, compute_force_reward(f, e, w))
     return 0.0

@@ -15,7 +15,7 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import MAX_ARM_AXES, MAX_PARAMETERS, draw_uniform, draw_uniform_between
-from hydrotele.envs.task import Task, draw_start
+from hydrotele.envs.task import Task, sample_start_positions
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
@@ -23,14 +23,14 @@ from hydrotele.envs.world import (
     TASK_SIGNATURE,
     TICK,
     ObservationField,
-    episode_records,
+    episode_states_view,
     max_reach,
     observation_view,
-    parameters_view,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward, task_jacobian
+from hydrotele.kinematics.task import compute_tip_pose, task_jacobian
 from hydrotele.machine.machine import Machine
 from hydrotele.soil.facts import (
     CAT215,
@@ -59,7 +59,7 @@ _SOIL_OFFSET = _RESULT_OFFSET + RESULT_SIZE
 TERRAIN_SIZE = _SOIL_OFFSET + _PARAMETER_COUNT
 
 
-def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
+def pack_soil_bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
     """Pack the parameters of bucket, soil profile and one to three soils as task parameters.
 
     Args:
@@ -82,7 +82,7 @@ def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray
 
 
 @compiled
-def surface_view(w):
+def soil_surface_view(w):
     """Return a view of the surface heights of the profile.
 
     Args:
@@ -97,7 +97,7 @@ def surface_view(w):
 
 
 @compiled
-def loose_view(w):
+def loose_thickness_view(w):
     """Return a view of the thickness of the loose soil on the profile.
 
     Args:
@@ -112,7 +112,7 @@ def loose_view(w):
 
 
 @compiled
-def bucket_view(w):
+def bucket_state_view(w):
     """Return a view of the soil state of the bucket, indexed by CARRIED_VOLUME to DEPTH of `soil.facts`.
 
     Args:
@@ -127,7 +127,7 @@ def bucket_view(w):
 
 
 @compiled
-def result_view(w):
+def soil_result_view(w):
     """Return a view of the result of the last soil step: force, moment, and mass carried with its centre.
 
     Args:
@@ -142,7 +142,7 @@ def result_view(w):
 
 
 @compiled
-def soil_view(w):
+def soil_parameters_view(w):
     """Return a view of the episode's parameters of soil, bucket and profile, from `pack_soil_parameters`.
 
     Args:
@@ -157,11 +157,11 @@ def soil_view(w):
 
 
 @compiled
-def init_bed(f, w, soil):
+def init_soil_bed(f, w, soil):
     """Initialise the terrain with level undisturbed soil at height 0 and an empty bucket.
 
     Args:
-        f: record of TASK_PARAMETERS; its parameters are those of `bed_parameters`.
+        f: record of TASK_PARAMETERS; its parameters are those of `pack_soil_bed_parameters`.
         w: SimulationView; `terrain` is written.
         soil: index of the soil, scalar [1].
 
@@ -171,7 +171,7 @@ def init_bed(f, w, soil):
     Source: this module.
     """
     w.terrain[:] = 0.0
-    numbers = soil_view(w)
+    numbers = soil_parameters_view(w)
     for i in range(_PARAMETER_COUNT):
         numbers[i] = f.parameters[i]
     if soil > 0:
@@ -181,7 +181,7 @@ def init_bed(f, w, soil):
 
 
 @compiled
-def compute_edge_rates(f, e, w, rates):
+def compute_bucket_edge_velocity(f, e, w, rates):
     """Compute the velocity of the bucket's edge, outwards and up, with the nominal kinematics.
 
     Only the damping of the soil uses it, which tolerates the slightly different geometry of a
@@ -209,7 +209,7 @@ def compute_edge_rates(f, e, w, rates):
 
 
 @compiled
-def step_bed(f, e, w):
+def step_soil_bed(f, e, w):
     """Advance soil and bucket by one control period; the force acts during the next period.
 
     Args:
@@ -230,10 +230,18 @@ def step_bed(f, e, w):
     ahead = w.xmat[9 * body : 9 * body + 9]  # first column points from the pin to the edge
     attitude = math.atan2(ahead[6], c * ahead[0] + s * ahead[3])
     rates = np.empty(2)
-    compute_edge_rates(f, e, w, rates)
-    out = result_view(w)
+    compute_bucket_edge_velocity(f, e, w, rates)
+    out = soil_result_view(w)
     edge = EdgeMotion(math.hypot(w.tip[0], w.tip[1]), w.tip[2], rates[0], rates[1], attitude)
-    step_soil(soil_view(w), surface_view(w), loose_view(w), bucket_view(w), edge, f.period, out)
+    step_soil(
+        soil_parameters_view(w),
+        soil_surface_view(w),
+        loose_thickness_view(w),
+        bucket_state_view(w),
+        edge,
+        f.period,
+        out,
+    )
     compute_bucket_wrench(out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6])
 
 
@@ -266,13 +274,13 @@ _CELLS_PER_SECTION = (END_CELL - FIRST_CELL) // SECTION_COUNT  # cells per secti
 assert 0 <= FIRST_CELL < END_CELL <= CELL_COUNT and _CELLS_PER_SECTION * SECTION_COUNT == END_CELL - FIRST_CELL
 
 
-def section_radii() -> list[float]:
+def profile_section_radii() -> list[float]:
     """Return the centre radii of the profile sections whose means are observed [m]."""
     return [MIN_RADIUS + (MAX_RADIUS - MIN_RADIUS) * (p + 0.5) / SECTION_COUNT for p in range(SECTION_COUNT)]
 
 
-def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_grade` writes: profile errors, edge height, mass, plane."""
+def list_grade_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_grade_observation` writes: profile errors, edge height, mass, plane."""
     far = max_reach(machine)
     fields = [ObservationField(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(SECTION_COUNT)]
     return [
@@ -285,7 +293,7 @@ def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
 
 
 @compiled
-def plane_height(g, r):
+def target_plane_height(g, r):
     """Return the height of the target plane at a radius.
 
     Args:
@@ -301,7 +309,7 @@ def plane_height(g, r):
 
 
 @compiled
-def profile_error(g, surface, first, last):
+def compute_profile_error(g, surface, first, last):
     """Return the mean and RMS height of the ground above the target plane in a range of cells.
 
     Args:
@@ -317,7 +325,7 @@ def profile_error(g, surface, first, last):
     """
     total, square = 0.0, 0.0
     for i in range(first, last):
-        over = surface[i] - plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
+        over = surface[i] - target_plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
         total += over
         square += over * over
     return total / (last - first), math.sqrt(square / (last - first))
@@ -333,7 +341,7 @@ def _add_mound(surface, middle, half, height):
 
 
 @compiled
-def begin_grade(f, e, w):
+def draw_grade_episode(f, e, w):
     """Draw the goal and terrain of an episode: soil, ground with two mounds, and target plane.
 
     Args:
@@ -350,13 +358,13 @@ def begin_grade(f, e, w):
     soils = int(f.parameters[len(f.parameters) - 1])
     soil = int(draw_uniform(e) * soils)
     g[SOIL_INDEX] = soil
-    init_bed(f, w, soil)
+    init_soil_bed(f, w, soil)
     ground = draw_uniform_between(e, _GROUND_HEIGHTS[0], _GROUND_HEIGHTS[1])
     g[PLANE_SLOPE] = draw_uniform_between(e, -_MAX_SLOPE, _MAX_SLOPE)
     g[PLANE_HEIGHT] = ground
-    surface = surface_view(w)
+    surface = soil_surface_view(w)
     for i in range(CELL_COUNT):
-        surface[i] = plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
+        surface[i] = target_plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
     g[PLANE_HEIGHT] = ground - draw_uniform_between(e, _PLANE_DEPTHS[0], _PLANE_DEPTHS[1])
     half = draw_uniform_between(e, _MOUND_HALF_LENGTHS[0], _MOUND_HALF_LENGTHS[1])
     _add_mound(
@@ -372,12 +380,12 @@ def begin_grade(f, e, w):
         half,
         draw_uniform_between(e, _LOW_MOUND_HEIGHTS[0], _LOW_MOUND_HEIGHTS[1]),
     )
-    g[LAST_ERROR], g[TIME_HELD] = profile_error(g, surface, FIRST_CELL, END_CELL)[1], 0.0
+    g[LAST_ERROR], g[TIME_HELD] = compute_profile_error(g, surface, FIRST_CELL, END_CELL)[1], 0.0
     w.measures[0], w.measures[3] = g[LAST_ERROR], g[SOIL_INDEX]
 
 
 @compiled
-def observe_grade(f, e, w, out, at):
+def write_grade_observation(f, e, w, out, at):
     """Write profile errors, height of the edge above ground, mass carried and plane to the observation.
 
     Args:
@@ -390,26 +398,26 @@ def observe_grade(f, e, w, out, at):
     Returns:
         Nothing.
 
-    Source: `grade_fields`; the position of the edge follows from the measured joint angles.
+    Source: `list_grade_observation_fields`; the position of the edge follows from the measured joint angles.
     """
-    g, surface = e.goal, surface_view(w)
+    g, surface = e.goal, soil_surface_view(w)
     pose = np.empty(MAX_ARM_AXES)
-    task_forward(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
     for p in range(SECTION_COUNT):
         first = FIRST_CELL + p * _CELLS_PER_SECTION
-        mean = profile_error(g, surface, first, first + _CELLS_PER_SECTION)[0]
+        mean = compute_profile_error(g, surface, first, first + _CELLS_PER_SECTION)[0]
         out[at + p] = mean + (draw_uniform_between(e, -scan, scan) if f.noisy else 0.0)
-    height = surface_height(soil_view(w), surface, pose[0])
+    height = surface_height(soil_parameters_view(w), surface, pose[0])
     out[at + SECTION_COUNT] = pose[2] - height - (draw_uniform_between(e, -scan, scan) if f.noisy else 0.0)
-    load = result_view(w)[MASS]
+    load = soil_result_view(w)[MASS]
     out[at + SECTION_COUNT + 1] = load + (draw_uniform_between(e, -scales, scales) if f.noisy else 0.0)
     out[at + SECTION_COUNT + 2] = g[PLANE_HEIGHT]
     out[at + SECTION_COUNT + 3] = g[PLANE_SLOPE]
 
 
 @compiled
-def reward_grade(f, e, w):
+def compute_grade_reward(f, e, w):
     """Compute the reward from the decrease of the profile error, minus a time cost.
 
     Args:
@@ -423,14 +431,14 @@ def reward_grade(f, e, w):
 
     Source: this module.
     """
-    g, out = e.goal, result_view(w)
+    g, out = e.goal, soil_result_view(w)
     dt = f.ticks * f.period
-    error = profile_error(g, surface_view(w), FIRST_CELL, END_CELL)[1]
+    error = compute_profile_error(g, soil_surface_view(w), FIRST_CELL, END_CELL)[1]
     reward = (g[LAST_ERROR] - error) / ERROR_PER_REWARD - TIME_COST * dt
     g[LAST_ERROR] = error
     g[TIME_HELD] = g[TIME_HELD] + dt if error < MAX_GRADED_ERROR else 0.0
     graded = g[TIME_HELD] >= HOLD_TIME - 0.5 * dt
-    spoiled = w.tip[2] < plane_height(g, math.hypot(w.tip[0], w.tip[1])) - FAILURE_DEPTH
+    spoiled = w.tip[2] < target_plane_height(g, math.hypot(w.tip[0], w.tip[1])) - FAILURE_DEPTH
     w.measures[0] = error
     w.measures[1] = out[MASS]
     w.measures[2] = math.hypot(out[FORCE_R], out[FORCE_Z])
@@ -454,14 +462,14 @@ _MIN_START_POSE = (
 _MAX_START_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw random arm positions with the bucket above the far end of the ground, ready to dig."""
-    return draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
+    return sample_start_positions(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
 
 
-def _make_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _make_soil_bed_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Return the MAX_PARAMETERS task parameters: bucket, profile and soils, and last the number of soils."""
-    bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
+    bed = pack_soil_bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
     return (*bed, *[0.0] * (MAX_PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
 
@@ -482,13 +490,13 @@ GRADE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=60.0,
-    start=_draw_start,
-    fields=grade_fields,
+    start=_sample_start_positions,
+    fields=list_grade_observation_fields,
     measures=(
         ("profile_rms", "m"), ("carried_mass", "kg"), ("soil_force", "N"), ("soil", "1"),
         ("success", "1"), ("spoiled", "1"),
     ),
-    parameters=_make_parameters,
+    parameters=_make_soil_bed_parameters,
     terrain_size=TERRAIN_SIZE,
     pose_rates=(0.5, 0.3, 0.4, 0.5, 0.25),
     swing_locked=True,
@@ -497,20 +505,20 @@ GRADE = Task(
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_grade(f, e, w)
+        draw_grade_episode(f, e, w)
     elif part == TICK:
-        step_bed(f, e, w)
+        step_soil_bed(f, e, w)
     elif part == OBSERVE:
-        observe_grade(f, e, w, observation_view(f, out), 0)
+        write_grade_observation(f, e, w, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_grade(f, e, w))
+        return store_episode_end(e, compute_grade_reward(f, e, w))
     return 0.0

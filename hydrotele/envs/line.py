@@ -11,22 +11,22 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
-from hydrotele.envs.task import Task, draw_start, measure_pose, path_effort, wrap_angle
+from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
     TASK_SIGNATURE,
     ObservationField,
-    episode_records,
+    episode_states_view,
+    make_pose_observation_fields,
     max_reach,
     observation_view,
-    parameters_view,
-    pose_fields,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
@@ -49,7 +49,7 @@ _MIN_RADIUS, _MIN_HEIGHT, _MAX_HEIGHT = (
     0.1,
     6.0,
 )  # m: minimum radius beyond the tracks, range of the height
-_MAX_EFFORT = 0.9  # maximum sum of relative axis rates, see `path_effort`
+_MAX_EFFORT = 0.9  # maximum sum of relative axis rates, see `compute_path_effort`
 _MAX_DRAWS, _FULL_SIZE_DRAWS = (
     240,
     200,
@@ -65,14 +65,14 @@ _CROSS_COLUMN = _ALONG_COLUMN + 1
 _RATE_BOUND = 1.0  # m/s, rad/s: bound of the reference rates
 
 
-def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_line` writes: reference pose, rates, preview, errors."""
+def list_line_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_line_observation` writes: reference pose, rates, preview, errors."""
     k, far = len(axes), max_reach(machine)
-    fields = pose_fields(machine, k, "reference")
+    fields = make_pose_observation_fields(machine, k, "reference")
     fields += [ObservationField(f"reference_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
                for c, unit in (("r", "m/s"), ("theta", "rad/s"), ("z", "m/s"))]  # fmt: skip
     for ahead in PREVIEW_TIMES:
-        fields += pose_fields(machine, k, f"reference_in_{ahead * 1000:.0f}_ms")[:3]
+        fields += make_pose_observation_fields(machine, k, f"reference_in_{ahead * 1000:.0f}_ms")[:3]
     return [
         *fields,
         ObservationField("along_track_error", "m", -2.0 * far, 2.0 * far),
@@ -81,7 +81,7 @@ def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFiel
 
 
 @compiled
-def begin_line(f, e):
+def draw_line_goal(f, e):
     """Draw the goal of an episode: a straight line from the present tip position, with speed and acceleration.
 
     Args:
@@ -94,7 +94,7 @@ def begin_line(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
-    task_forward(f.arm, e.position[: f.arm_axes], start)
+    compute_tip_pose(f.arm, e.position[: f.arm_axes], start)
     for c in range(4):
         g[_START + c] = start[c]
     speed, g[_ACCELERATION] = (
@@ -120,12 +120,12 @@ def begin_line(f, e):
         end = start + change
         if end[_R] < _MIN_RADIUS or not _MIN_HEIGHT <= end[_Z] <= _MAX_HEIGHT:
             continue
-        if path_effort(f, start, change) * g[_SPEED] / length <= _MAX_EFFORT:
+        if compute_path_effort(f, start, change) * g[_SPEED] / length <= _MAX_EFFORT:
             break
 
 
 @compiled
-def line_travel(g, time):
+def compute_line_travel(g, time):
     """Return the distance that the reference has travelled along the line at a time, and its speed.
 
     Args:
@@ -165,7 +165,7 @@ def compute_line_pose(g, time, pose, rate):
 
     Source: this module.
     """
-    way, speed = line_travel(g, time)
+    way, speed = compute_line_travel(g, time)
     for c in range(3):
         pose[c] = g[_START + c] + way * g[_PER_METRE + c]
         rate[c] = speed * g[_PER_METRE + c]
@@ -174,7 +174,7 @@ def compute_line_pose(g, time, pose, rate):
 
 
 @compiled
-def line_errors(g, reference, r, theta, z):
+def compute_line_errors(g, reference, r, theta, z):
     """Return the along-track and cross-track errors of the tip.
 
     Args:
@@ -198,7 +198,7 @@ def line_errors(g, reference, r, theta, z):
 
 
 @compiled
-def observe_line(f, e, out, at):
+def write_line_observation(f, e, out, at):
     """Write the reference pose now and ahead, and the measured tracking errors, to the observation.
 
     Args:
@@ -210,7 +210,7 @@ def observe_line(f, e, out, at):
     Returns:
         Nothing.
 
-    Source: `line_fields`.
+    Source: `list_line_observation_fields`.
     """
     now, pose, rate, tip = (
         e.tick * f.period,
@@ -219,12 +219,12 @@ def observe_line(f, e, out, at):
         np.empty(MAX_ARM_AXES),
     )
     compute_line_pose(e.goal, now, pose, rate)
-    measure_pose(f, e, tip)
+    compute_measured_pose(f, e, tip)
     for c in range(4):
         out[at + _POSE_COLUMN + c] = pose[c]
     for c in range(3):
         out[at + _RATE_COLUMN + c] = rate[c]
-    along, across = line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
+    along, across = compute_line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
     out[at + _ALONG_COLUMN], out[at + _CROSS_COLUMN] = along, across
     for p in range(len(PREVIEW_TIMES)):
         compute_line_pose(e.goal, now + PREVIEW_TIMES[p], pose, rate)
@@ -240,7 +240,7 @@ def reward_from_errors(across, along, attitude):
 
 
 @compiled
-def reward_line(f, e, w):
+def compute_line_reward(f, e, w):
     """Compute the reward of a step from the errors of the true tip position.
 
     Args:
@@ -257,15 +257,15 @@ def reward_line(f, e, w):
     pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
     compute_line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
-    along, across = line_errors(e.goal, pose, r, theta, e.tip[2])
+    along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
     attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
     return reward_from_errors(across, along, attitude), False
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw random arm positions with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
-    return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
+    return sample_start_positions(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
 STRAIGHT_LINE = Task(
@@ -283,8 +283,8 @@ STRAIGHT_LINE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=16.5,  # s: enough for the longest and slowest line
-    start=_draw_start,
-    fields=line_fields,
+    start=_sample_start_positions,
+    fields=list_line_observation_fields,
     measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
     # a higher gain excites the oil resonance of the boom near the end of its range
     servo=Servo(axis_gains={"boom": 2.0}),
@@ -294,18 +294,18 @@ STRAIGHT_LINE = Task(
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_line(f, e)
+        draw_line_goal(f, e)
     elif part == OBSERVE:
-        observe_line(f, e, observation_view(f, out), 0)
+        write_line_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_line(f, e, w))
+        return store_episode_end(e, compute_line_reward(f, e, w))
     return 0.0

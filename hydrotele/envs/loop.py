@@ -1,6 +1,6 @@
 """Environment step in native code: actions, control, sensors, reward and reset.
 
-MuJoCo calls `advance` for every simulation from its own threads, without the Python interpreter.
+MuJoCo calls `step_or_reset_simulation` for every simulation from its own threads, without the Python interpreter.
 Joint-rate actions move the joint references; pose-rate actions move them by resolved motion. The
 joint servo tracks the references. The acceleration of the references is limited, since a machine of
 20 t cannot follow a step.
@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numba import carray, types
 
-from hydrotele.control.resolved_motion import follow_pose
+from hydrotele.control.resolved_motion import step_references_to_pose
 from hydrotele.control.servo import (
     TABLE_POINTS,
     ComputedForce,
@@ -42,17 +42,17 @@ from hydrotele.envs.world import (
     OBSERVE,
     REWARD,
     TICK,
-    call_task,
-    episode_records,
-    observe_machine,
-    parameters_view,
+    call_task_part,
+    episode_states_view,
     simulation_view,
+    task_parameters_view,
+    write_machine_observation,
 )
 from hydrotele.hydraulics.parameters import SLOT_COUNT
-from hydrotele.kinematics.task import task_forward
-from hydrotele.simulate.feedback import Readings, SensorParameters, read_sensors, store_readings
+from hydrotele.kinematics.task import compute_tip_pose
+from hydrotele.simulate.feedback import Readings, SensorParameters, convert_to_readings, store_readings
 from hydrotele.simulate.fleet import STATE_KIND
-from hydrotele.simulate.layout import call_set_state
+from hydrotele.simulate.layout import call_mj_set_state
 from hydrotele.simulate.stepping import (
     CommandDelayLine,
     SensorHistory,
@@ -107,7 +107,7 @@ def _integrate_pose_rates(f, e, action):
     far = False
     for i in range(k):
         far = far or abs(e.reference[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
-    held = far or follow_pose(
+    held = far or step_references_to_pose(
         f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
         e.reference_rate[:k],
     )  # fmt: skip
@@ -118,11 +118,11 @@ def _integrate_pose_rates(f, e, action):
     if far:  # the arm is blocked by an obstacle: continue from its measured position
         for i in range(k):
             e.reference[i] = _limit_change(e.joint[i], e.reference[i], _MAX_REFERENCE_LEAD)
-        task_forward(f.arm, e.reference[:k], e.pose)
+        compute_tip_pose(f.arm, e.reference[:k], e.pose)
 
 
 @compiled
-def apply_action(f, e, action):
+def convert_action_to_commands(f, e, action):
     """Convert the action into valve commands, or into references of the servo.
 
     Args:
@@ -185,7 +185,7 @@ def update_sensors(f, e, sim):
         float64_view(scales, c), float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c), f.converters[0],
         f.converters[1], f.converters[2],
     )  # fmt: skip
-    read_sensors(sensors, values, e.error[:c])
+    convert_to_readings(sensors, values, e.error[:c])
     span = f.every * f.period if e.tick > 0 else 0.0
     readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
     e.supply = store_readings(values, f.hydraulic, span, readings)
@@ -203,7 +203,7 @@ _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 
 @compiled
-def _make_simulation(f, e, w):
+def _make_simulation_record(f, e, w):
     """Collect the arrays of an episode's simulation, with its delay lines, in a record for `simulate.stepping`."""
     ring = float64_view(f.commands + 8 * w.index * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
         (f.delayed_command, MAX_AXES)
@@ -259,7 +259,7 @@ def _begin_episode(f, e, w):
     e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(draw_uniform(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
-    call_set_state(f.mj_set_state, w.model, w.data, start, STATE_KIND)
+    call_mj_set_state(f.mj_set_state, w.model, w.data, start, STATE_KIND)
     places = carray(address_to_pointer(f.places), (3 * f.fields,), np.int64)
     for n in range(f.fields):
         size = places[3 * n + 2]
@@ -272,7 +272,7 @@ def _begin_episode(f, e, w):
     e.command[:] = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
-    sim = _make_simulation(f, e, w)
+    sim = _make_simulation_record(f, e, w)
     initialise_history(sim, w.ctrl)
     tips = float64_view(f.start_tips + 24 * e.variant, 3)
     copy_values(e.tip, tips)
@@ -281,11 +281,11 @@ def _begin_episode(f, e, w):
     for i in range(len(e.joint)):
         e.reference[i] = e.sampled_reference[i] = e.joint[i]
     if f.arm_axes > 0:
-        task_forward(f.arm, e.reference[: f.arm_axes], e.pose)
+        compute_tip_pose(f.arm, e.reference[: f.arm_axes], e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
     w.measures[:] = 0.0
-    call_task(f, w, BEGIN, 0)
+    call_task_part(f, w, BEGIN, 0)
 
 
 @compiled
@@ -295,8 +295,8 @@ def _write_observation(f, e, w, address):
     out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
     low = carray(address_to_pointer(f.low), (n,), np.float32)
     high = carray(address_to_pointer(f.high), (n,), np.float32)
-    at = observe_machine(f, e, out)
-    call_task(f, w, OBSERVE, address + 4 * (w.index * n + at))
+    at = write_machine_observation(f, e, out)
+    call_task_part(f, w, OBSERVE, address + 4 * (w.index * n + at))
     for c in range(n):
         if not low[c] <= out[c] <= high[c]:
             e.saturated += 1
@@ -304,30 +304,30 @@ def _write_observation(f, e, w, address):
 
 
 @compiled
-def _run_step(f, e, w, action):
+def _run_environment_step(f, e, w, action):
     """Run one environment step; return the reward, `terminated` and `truncated`."""
-    sim = _make_simulation(f, e, w)
+    sim = _make_simulation_record(f, e, w)
     for _ in range(f.ticks):
-        apply_action(f, e, action)
+        convert_action_to_commands(f, e, action)
         _run_control_period(f, e, sim)
         e.tick += 1
         update_sensors(f, e, sim)
-        call_task(f, w, TICK, 0)  # after the physics: before it, body positions belong to another simulation
+        call_task_part(f, w, TICK, 0)  # after the physics: before it, body positions belong to another simulation
     copy_values(e.tip, w.tip)
     e.step += 1
     if _check_stability(f, e, w.data):
         e.fault = 1
         e.faults += 1
         return 0.0, True, False
-    reward = call_task(f, w, REWARD, 0)
+    reward = call_task_part(f, w, REWARD, 0)
     done = e.over != 0
     return reward, done, e.step >= f.horizon and not done
 
 
 @compiled
-def _advance_simulation(m, d, sim, argument):
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[sim], simulation_view(f, m, d, sim, argument)
+def _step_or_reset_simulation(m, d, sim, argument):
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[sim], simulation_view(f, m, d, sim, argument)
     reward = carray(address_to_pointer(f.reward), (f.count,), np.float64)
     terminated = carray(address_to_pointer(f.terminated), (f.count,), np.uint8)
     truncated = carray(address_to_pointer(f.truncated), (f.count,), np.uint8)
@@ -340,7 +340,7 @@ def _advance_simulation(m, d, sim, argument):
     if f.autoreset == DISABLED and e.over != 0:
         return
     action = carray(address_to_pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
-    value, done, late = _run_step(f, e, w, action)
+    value, done, late = _run_environment_step(f, e, w, action)
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
@@ -351,10 +351,10 @@ def _advance_simulation(m, d, sim, argument):
 
 
 @callback(_SIGNATURE)
-def advance(m, d, sim, argument):
+def step_or_reset_simulation(m, d, sim, argument):
     """Step or reset one simulation.
 
     The arguments are the addresses of mjModel and mjData, the index of the simulation and the address of
     TASK_PARAMETERS, whose `call` selects step or reset.
     """
-    _advance_simulation(m, d, sim, argument)
+    _step_or_reset_simulation(m, d, sim, argument)

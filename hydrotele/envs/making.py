@@ -24,18 +24,18 @@ from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
 from hydrotele.envs.force import HOLD_FORCE
 from hydrotele.envs.grade import GRADE
 from hydrotele.envs.line import STRAIGHT_LINE
-from hydrotele.envs.loop import advance
+from hydrotele.envs.loop import step_or_reset_simulation
 from hydrotele.envs.place import PLACE_LOG
 from hydrotele.envs.reach import REACH_FELLER
 from hydrotele.envs.stage import Camera, TaskRenderer
 from hydrotele.envs.task import Options, Task
-from hydrotele.envs.track import track_fields
+from hydrotele.envs.track import list_track_observation_fields
 from hydrotele.machine.machine import Machine
-from hydrotele.show.canvas import write_markers
+from hydrotele.show.canvas import add_markers_to_scene
 from hydrotele.show.window import check_screen
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw axis positions uniformly from the middle 40 % of their ranges."""
     places = {}
     for name, axis in machine.axes.items():
@@ -54,8 +54,8 @@ TASKS = {
             reward="The reward is 1 minus 1 for every 0.1 m of tip error, at least -1.",
             machine="cat215",
             tool="none",
-            start=_draw_start,
-            fields=track_fields,
+            start=_sample_start_positions,
+            fields=list_track_observation_fields,
             measures=(("tip_error", "m"),),
         ),
         STRAIGHT_LINE,
@@ -76,7 +76,7 @@ _COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import compile_openi
 AUTORESET_MODES = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 
-def make_core(task: str, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
+def make_task_core(task: str, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
     """Make a running task from its name and options.
 
     Args:
@@ -99,7 +99,9 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, auto
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest_valid_name(name, known))
     options = _validate_options(choices)
-    advance.compile_in_background(_COMPILE_LOOPS_COMMAND)  # while the plant's own code is compiled here
+    step_or_reset_simulation.compile_in_background(
+        _COMPILE_LOOPS_COMMAND
+    )  # while the plant's own code is compiled here
     return TaskCore(TASKS[task], options, count, threads, autoreset)
 
 
@@ -210,7 +212,7 @@ class TaskWindow:
             scene = self._viewer.user_scn
             assert scene is not None
             scene.ngeom = 0
-            write_markers(scene, self._stage.markers())
+            add_markers_to_scene(scene, self._stage.make_markers())
         self._viewer.sync()
         now = time.monotonic()
         self._next_time = max(self._next_time + self._period, now)
@@ -259,7 +261,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         check_render_mode(render_mode, self.metadata["render_modes"])
         if render_mode == "human":
             check_screen(NO_SCREEN_ADVICE)
-        self.core = make_core(task, options, 1, 1, DISABLED)
+        self.core = make_task_core(task, options, 1, 1, DISABLED)
         self.metadata = add_render_fps(self.metadata, self.core)
         self.render_mode, self._image_settings = render_mode, (width, height, camera)
         self._stage: TaskRenderer | None = None
@@ -329,9 +331,9 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 gymnasium.logger.warn("render() returns None without render_mode='rgb_array'")
             return None
         width, height, camera = self._image_settings
-        return self._get_stage().render(0, width, height, camera)
+        return self._get_renderer().render(0, width, height, camera)
 
-    def _get_stage(self) -> TaskRenderer:
+    def _get_renderer(self) -> TaskRenderer:
         if self._stage is None:
             self._stage = TaskRenderer(self.core)
         return self._stage
@@ -341,7 +343,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.render_mode != "human":
             return
         if self._window is None:
-            self._window = TaskWindow(self._get_stage(), self._image_settings[2], self.metadata["render_fps"])
+            self._window = TaskWindow(self._get_renderer(), self._image_settings[2], self.metadata["render_fps"])
         self._window.show()
 
     def __reduce__(self):
@@ -395,7 +397,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         check_render_mode(render_mode, self.metadata["render_modes"])
         mode = AutoresetMode(autoreset_mode)
-        self.core = make_core(task, options, num_envs, threads, AUTORESET_MODES[mode.value])
+        self.core = make_task_core(task, options, num_envs, threads, AUTORESET_MODES[mode.value])
         self.metadata = {**add_render_fps(self.metadata, self.core), "autoreset_mode": mode}
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_observation_space = make_observation_space(self.core)
@@ -425,7 +427,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             RuntimeError: the first reset does not include all environments.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = self._select_environments(options)
+        chosen = self._parse_reset_mask(options)
         seeds = self._seeds(seed)
         if seeds is not None and chosen is not None:
             seeds = seeds[chosen]
@@ -433,7 +435,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._is_started = True
         return self.core.observation.copy(), self._make_infos(chosen)
 
-    def _select_environments(self, options: dict[str, Any] | None) -> np.ndarray | None:
+    def _parse_reset_mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
         if not options or "reset_mask" not in options:
             return None
         mask = options["reset_mask"]
@@ -482,16 +484,16 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _make_infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
         there = np.zeros(self.num_envs, bool)
         there[slice(None) if chosen is None else chosen] = True
-        return _add_masks(make_info(self.core), there)
+        return _add_validity_masks(make_info(self.core), there)
 
     def _add_final_infos(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Add the final observations and infos of the episodes that were reset in this step."""
         observations = np.full(self.num_envs, None, dtype=object)
         for number in np.flatnonzero(over):
             observations[number] = self.core.final_observation[number].copy()
-        last = _add_masks(make_info(self.core, final=True), over)
+        last = _add_validity_masks(make_info(self.core, final=True), over)
         final = {"final_obs": observations, "final_info": last}
-        return infos | _add_masks(final, over)
+        return infos | _add_validity_masks(final, over)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Render the machines and their goals.
@@ -521,6 +523,6 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.core.close()
 
 
-def _add_masks(infos: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
+def _add_validity_masks(infos: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Add gymnasium's masks, which mark the environments for which an entry is valid."""
     return infos | {f"_{name}": mask.copy() for name in infos}

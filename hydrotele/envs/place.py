@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
-from hydrotele.envs.task import Task, draw_start
+from hydrotele.envs.task import Task, sample_start_positions
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
@@ -21,14 +21,14 @@ from hydrotele.envs.world import (
     TASK_SIGNATURE,
     TICK,
     ObservationField,
-    episode_records,
+    episode_states_view,
     max_reach,
     observation_view,
-    parameters_view,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import LogOnGround, Servo
 from hydrotele.simulate.feedback import quantise_reading
@@ -38,7 +38,7 @@ from hydrotele.simulate.surroundings import (
     TAKEN,
     WELD_SIZE,
     grip_step,
-    log_grip,
+    timber_log_grip_parameters,
 )
 
 GRAPPLE_BODY, LOG_BODY, WELD_ID, JAW_QPOS, LOG_QPOS, LOG_RADIUS, LOG_HALF_LENGTH = range(
@@ -50,7 +50,7 @@ MEASURED_START = 0  # index in `goal` of the measured values: pitch, roll, their
 MEASURED_COUNT = 4  # number of measured values of the free joints
 
 
-def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+def pack_grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Return the task parameters for a grapple and one log.
 
     Args:
@@ -71,11 +71,11 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
     ]  # fmt: skip
     for name in FREE_JOINTS:
         places += [model.joint(name).qposadr[0], model.joint(name).dofadr[0]]
-    return np.concatenate([log_grip(model, log), np.array(places, float)])
+    return np.concatenate([timber_log_grip_parameters(model, log), np.array(places, float)])
 
 
 @compiled
-def is_held(f, w):
+def is_log_held(f, w):
     """Return whether the grapple holds the log.
 
     Args:
@@ -91,7 +91,7 @@ def is_held(f, w):
 
 
 @compiled
-def _body_values(values, count, at):
+def _slice_body_values(values, count, at):
     """Return the `count` values of the body with index `at` from an array of all bodies."""
     return values[count * at : count * at + count]
 
@@ -105,8 +105,8 @@ def _update_grip(f, w):
     )
     first = weld * f.eq_width
     change = grip_step(
-        f.parameters[:GRIP_SIZE], _body_values(w.xpos, 3, hand), _body_values(w.xquat, 4, hand),
-        _body_values(w.xpos, 3, log), _body_values(w.xquat, 4, log), w.qpos[int(f.parameters[JAW_QPOS])],
+        f.parameters[:GRIP_SIZE], _slice_body_values(w.xpos, 3, hand), _slice_body_values(w.xquat, 4, hand),
+        _slice_body_values(w.xpos, 3, log), _slice_body_values(w.xquat, 4, log), w.qpos[int(f.parameters[JAW_QPOS])],
         w.eq_active[weld] != 0, w.eq_rows[first : first + WELD_SIZE],
     )  # fmt: skip
     if change == 0:
@@ -151,7 +151,7 @@ def update_grapple(f, e, w):
     """Grip or release the log according to the jaw angle, and measure the swing joints of the grapple.
 
     Args:
-        f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
+        f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
         e: record of EPISODE_STATE; `goal` is written.
         w: SimulationView after a physics step; the weld is written.
 
@@ -165,7 +165,7 @@ def update_grapple(f, e, w):
 
 
 @compiled
-def grip_distance(f, w):
+def compute_grip_misalignment(f, w):
     """Return the distance and the angle between the grapple's pocket and the log.
 
     Args:
@@ -183,7 +183,7 @@ def grip_distance(f, w):
         int(f.parameters[LOG_BODY]),
         f.parameters[GRIP_SIZE - 1],
     )
-    turn, own = _body_values(w.xmat, 9, hand), _body_values(w.xmat, 9, log)
+    turn, own = _slice_body_values(w.xmat, 9, hand), _slice_body_values(w.xmat, 9, log)
     along, across, square = 0.0, 0.0, 0.0
     way = np.empty(3)
     for c in range(3):
@@ -199,7 +199,7 @@ def grip_distance(f, w):
 
 
 @compiled
-def tilt_angle(f, w):
+def grapple_tilt_angle(f, w):
     """Return the angle between the grapple and the vertical.
 
     Args:
@@ -246,8 +246,8 @@ GOAL_POSE = slice(_X, _YAW + 1)  # slice of `goal`: x [m], y [m], yaw [rad] of t
 _RATE_BOUND = 10.0  # rad/s, bound of the difference quotient of noisy samples
 
 
-def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_place` writes: log, goal, held, free joints."""
+def list_place_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_place_observation` writes: log, goal, held, free joints."""
     far = 2.0 * max_reach(machine)
     fields = []
     for what, high in (("log", ("z",)), ("goal", ())):
@@ -265,11 +265,11 @@ def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
 
 
 @compiled
-def begin_place(f, e, w):
+def draw_log_poses(f, e, w):
     """Draw the start pose and the goal pose of the log.
 
     Args:
-        f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
+        f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
         e: record of EPISODE_STATE; `goal` is written.
         w: SimulationView; the log's coordinates are written.
 
@@ -279,7 +279,7 @@ def begin_place(f, e, w):
     Source: this module.
     """
     g, pose, at = e.goal, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
-    task_forward(f.arm, e.position[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, e.position[: f.arm_axes], pose)
     radius, theta = (
         draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
         pose[1] + _draw_with_random_sign(e, _LOG_ANGLES),
@@ -303,7 +303,7 @@ def _draw_with_random_sign(e, size):
 
 
 @compiled
-def log_pose(f, w):
+def compute_wood_log_pose(f, w):
     """Return the position and the direction of the wooden log.
 
     Args:
@@ -327,7 +327,7 @@ def log_pose(f, w):
 
 
 @compiled
-def yaw_difference(sine, cosine, yaw):
+def undirected_yaw_difference(sine, cosine, yaw):
     """Return the angle between two undirected horizontal axes.
 
     Args:
@@ -345,7 +345,7 @@ def yaw_difference(sine, cosine, yaw):
 
 
 @compiled
-def observe_place(f, e, w, out, at):
+def write_place_observation(f, e, w, out, at):
     """Write the poses of log and goal, whether the log is held, and the swing of the grapple to the observation.
 
     Args:
@@ -358,21 +358,21 @@ def observe_place(f, e, w, out, at):
     Returns:
         Nothing.
 
-    Source: `place_fields`.
+    Source: `list_place_observation_fields`.
     """
     g = e.goal
-    x, y, z, sine, cosine, _ = log_pose(f, w)
+    x, y, z, sine, cosine, _ = compute_wood_log_pose(f, w)
     out[at], out[at + 1], out[at + 2] = math.hypot(x, y), math.atan2(y, x), z
     out[at + 3], out[at + 4] = sine, cosine
     out[at + 5], out[at + 6] = math.hypot(g[_X], g[_Y]), math.atan2(g[_Y], g[_X])
     out[at + 7], out[at + 8] = math.sin(2.0 * g[_YAW]), math.cos(2.0 * g[_YAW])
-    out[at + 9] = 1.0 if is_held(f, w) else 0.0
+    out[at + 9] = 1.0 if is_log_held(f, w) else 0.0
     for c in range(MEASURED_COUNT):
         out[at + 10 + c] = g[MEASURED_START + c]
 
 
 @compiled
-def reward_place(f, e, w):
+def compute_place_reward(f, e, w):
     """Compute the reward of a step for moving the grapple to the log and the log to its goal.
 
     Args:
@@ -386,16 +386,16 @@ def reward_place(f, e, w):
 
     Source: this module.
     """
-    g, held = e.goal, is_held(f, w)
-    x, y, z, sine, cosine, slope = log_pose(f, w)
+    g, held = e.goal, is_log_held(f, w)
+    x, y, z, sine, cosine, slope = compute_wood_log_pose(f, w)
     height = z - f.parameters[LOG_RADIUS]
     distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
-    yaw, swing = yaw_difference(sine, cosine, g[_YAW]), tilt_angle(f, w)
+    yaw, swing = undirected_yaw_difference(sine, cosine, g[_YAW]), grapple_tilt_angle(f, w)
     lies = not held and height < _LYING_TOLERANCE and abs(slope) < _LYING_TOLERANCE
     there = lies and distance <= MAX_DISTANCE and yaw <= MAX_YAW_ERROR
     left = distance + YAW_WEIGHT * yaw
     if not (held or there):
-        apart, askew = grip_distance(f, w)
+        apart, askew = compute_grip_misalignment(f, w)
         left += apart + MISALIGNMENT_WEIGHT * askew
     if g[_REMAINING_DISTANCE] < 0.0:  # first step: the position of the grapple is not known before
         g[_REMAINING_DISTANCE] = left
@@ -418,7 +418,7 @@ def reward_place(f, e, w):
 
 
 LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
-"""The log; `begin_place` overwrites its pose."""
+"""The log; `draw_log_poses` overwrites its pose."""
 
 _MIN_START_POSE, _MAX_START_POSE = (
     (4.5, -0.5, 2.2),
@@ -426,16 +426,16 @@ _MIN_START_POSE, _MAX_START_POSE = (
 )  # m, rad, m: start of the pin at the stick's tip
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw random joint positions with the open grapple hanging vertically above the height of a log."""
-    joints = draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
+    joints = sample_start_positions(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(rng.uniform(-0.5, 0.5) * math.pi)
     return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
 
 
-def _make_parameters(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
-    return grapple_parameters(machine, model, LOG_TO_PLACE)
+def _make_grapple_parameters(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
+    return pack_grapple_parameters(machine, model, LOG_TO_PLACE)
 
 
 PLACE_LOG = Task(
@@ -459,15 +459,15 @@ PLACE_LOG = Task(
     extra_axes=("grapple", "claw"),
     action="resolved_motion",
     duration=60.0,
-    start=_draw_start,
-    fields=place_fields,
+    start=_sample_start_positions,
+    fields=list_place_observation_fields,
     measures=(
         ("log_distance", "m"), ("yaw_error", "rad"), ("held", "1"), ("success", "1"),
         ("swing_angle", "rad"),
     ),
     surroundings=lambda *_: (LOG_TO_PLACE,),
     ground=True,
-    parameters=_make_parameters,
+    parameters=_make_grapple_parameters,
     written_fields=("eq_data",),
     # with the default of 4 /s, valve delay and stiction make boom and grapple oscillate
     servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
@@ -476,20 +476,20 @@ PLACE_LOG = Task(
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_place(f, e, w)
+        draw_log_poses(f, e, w)
     elif part == TICK:
         update_grapple(f, e, w)
     elif part == OBSERVE:
-        observe_place(f, e, w, observation_view(f, out), 0)
+        write_place_observation(f, e, w, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_place(f, e, w))
+        return store_episode_end(e, compute_place_reward(f, e, w))
     return 0.0

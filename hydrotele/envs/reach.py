@@ -10,22 +10,22 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform_between
-from hydrotele.envs.task import Task, draw_start, measure_pose, path_effort, wrap_angle
+from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
     TASK_SIGNATURE,
     ObservationField,
-    episode_records,
+    episode_states_view,
+    make_pose_observation_fields,
     max_reach,
     observation_view,
-    parameters_view,
-    pose_fields,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
@@ -53,17 +53,17 @@ _SHRINK_FACTOR = 0.7  # factor of the path per draw after those
 _TARGET, _TIME_HELD, _REMAINING_DISTANCE = 0, 5, 6  # indices in `goal`
 
 
-def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_reach` writes: goal pose, measured distance, time held."""
+def list_reach_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_reach_observation` writes: goal pose, measured distance, time held."""
     return [
-        *pose_fields(machine, len(axes), "reference"),
+        *make_pose_observation_fields(machine, len(axes), "reference"),
         ObservationField("distance", "m", 0.0, 2.0 * max_reach(machine)),
         ObservationField("held", "s", 0.0, 2.0 * HOLD_TIME),
     ]
 
 
 @compiled
-def begin_reach(f, e):
+def draw_reach_goal(f, e):
     """Draw a goal pose that the arm can reach on a straight path from its start.
 
     Args:
@@ -76,7 +76,7 @@ def begin_reach(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
-    task_forward(f.arm, e.position[: f.arm_axes], start)
+    compute_tip_pose(f.arm, e.position[: f.arm_axes], start)
     size = 1.0
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
@@ -88,14 +88,14 @@ def begin_reach(f, e):
         change[4] = size * (draw_uniform_between(e, -_MAX_GOAL_HEAD, _MAX_GOAL_HEAD) - start[4])
         for c in range(MAX_ARM_AXES):
             g[_TARGET + c] = start[c] + change[c]
-        if path_effort(f, start, change) < np.inf:
+        if compute_path_effort(f, start, change) < np.inf:
             break
     g[_TIME_HELD] = 0.0
-    g[_REMAINING_DISTANCE] = remaining_distance(*_true_errors(f, e))
+    g[_REMAINING_DISTANCE] = combine_pose_errors(*_compute_true_pose_errors(f, e))
 
 
 @compiled
-def reach_errors(target, x, y, z, attitude, head):
+def compute_pose_errors(target, x, y, z, attitude, head):
     """Return the position and angle errors of the tip with respect to the goal pose.
 
     Args:
@@ -118,20 +118,20 @@ def reach_errors(target, x, y, z, attitude, head):
 
 
 @compiled
-def remaining_distance(distance, angle):
+def combine_pose_errors(distance, angle):
     """Return position error [m] plus `ANGLE_WEIGHT` [m/rad] times angle error [rad] as one distance [m]."""
     return distance + ANGLE_WEIGHT * angle
 
 
 @compiled
-def _true_errors(f, e):
+def _compute_true_pose_errors(f, e):
     attitude = e.position[1] + e.position[2] + e.position[3]
     target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
-    return reach_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
+    return compute_pose_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
 
 
 @compiled
-def observe_reach(f, e, out, at):
+def write_reach_observation(f, e, out, at):
     """Write the goal pose, the measured distance to it, and the time it has been held to the observation.
 
     Args:
@@ -143,20 +143,20 @@ def observe_reach(f, e, out, at):
     Returns:
         Nothing.
 
-    Source: `reach_fields`.
+    Source: `list_reach_observation_fields`.
     """
     tip = np.empty(MAX_ARM_AXES)
-    measure_pose(f, e, tip)
+    compute_measured_pose(f, e, tip)
     for c in range(MAX_ARM_AXES):
         out[at + c] = e.goal[_TARGET + c]
     x, y = tip[0] * math.cos(tip[1]), tip[0] * math.sin(tip[1])
     target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
-    out[at + MAX_ARM_AXES] = reach_errors(target, x, y, tip[2], tip[3], tip[4])[0]
+    out[at + MAX_ARM_AXES] = compute_pose_errors(target, x, y, tip[2], tip[3], tip[4])[0]
     out[at + MAX_ARM_AXES + 1] = e.goal[_TIME_HELD]
 
 
 @compiled
-def reward_reach(f, e, w):
+def compute_reach_reward(f, e, w):
     """Compute the reward of a step from the decrease of the remaining distance to the goal pose.
 
     Holding the pose for `HOLD_TIME` pays an extra reward and ends the episode.
@@ -173,8 +173,8 @@ def reward_reach(f, e, w):
     Source: this module.
     """
     g = e.goal
-    distance, angle = _true_errors(f, e)
-    left = remaining_distance(distance, angle)
+    distance, angle = _compute_true_pose_errors(f, e)
+    left = combine_pose_errors(distance, angle)
     reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST
     g[_REMAINING_DISTANCE] = left
     inside = distance <= MAX_DISTANCE and angle <= MAX_ANGLE
@@ -185,9 +185,9 @@ def reward_reach(f, e, w):
     return reward + (SUCCESS_REWARD if done else 0.0), done
 
 
-def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw random arm positions with the head in the air in front of the machine, about level."""
-    return draw_start(
+    return sample_start_positions(
         machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
     )  # fmt: skip
 
@@ -204,8 +204,8 @@ REACH_FELLER = Task(
     machine="cat325",
     tool=None,
     duration=20.0,
-    start=_draw_start,
-    fields=reach_fields,
+    start=_sample_start_positions,
+    fields=list_reach_observation_fields,
     measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
     servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # large inertia on compressible oil
     pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
@@ -214,18 +214,18 @@ REACH_FELLER = Task(
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_reach(f, e)
+        draw_reach_goal(f, e)
     elif part == OBSERVE:
-        observe_reach(f, e, observation_view(f, out), 0)
+        write_reach_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_reach(f, e, w))
+        return store_episode_end(e, compute_reach_reward(f, e, w))
     return 0.0

@@ -15,10 +15,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.facts import TaskSetup
-from hydrotele.envs.making import make_action_space, make_core, make_observation_space
+from hydrotele.envs.making import make_action_space, make_observation_space, make_task_core
 
 
-def find_reference_pairs(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
+def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return the observation columns of all references and of the matching measured values.
 
     Args:
@@ -66,7 +66,7 @@ class AgentInterface:
             max_fraction: maximum action of the agent as a fraction of a full action.
         """
         self._controller, self._max_fraction, self._history = controller, max_fraction, history
-        self._reference_columns, self._measured_columns = find_reference_pairs(setup)
+        self._reference_columns, self._measured_columns = find_reference_and_measured_columns(setup)
         self._actions = len(setup.axes)
         self._step_size = len(setup.fields) + len(self._reference_columns)
         self.observation_size = history * self._step_size + (self._actions if controller else 0)
@@ -85,39 +85,39 @@ class AgentInterface:
         if self._controller:
             self._controller.reset(mask)
 
-    def _append_errors(self, observation: np.ndarray) -> np.ndarray:
+    def _append_reference_errors(self, observation: np.ndarray) -> np.ndarray:
         errors = observation[:, self._reference_columns] - observation[:, self._measured_columns]
         return np.concatenate([observation, errors], axis=1)
 
-    def _build_observation(self, past: np.ndarray, base: np.ndarray) -> np.ndarray:
+    def _build_agent_observation(self, past: np.ndarray, base: np.ndarray) -> np.ndarray:
         flat = past.reshape(len(past), -1)
         return np.concatenate([flat, base], axis=1) if self._controller else flat.copy()
 
-    def observe(self, observation: np.ndarray) -> np.ndarray:
+    def make_agent_observation(self, observation: np.ndarray) -> np.ndarray:
         """Return the agent's observation (n, size) for environment observations (n, o).
 
         It holds the last steps with their reference errors and, with a controller, the controller's action.
         """
-        now = self._append_errors(observation)
+        now = self._append_reference_errors(observation)
         self._stacked_steps[:, 1:] = self._stacked_steps[:, :-1]
         self._stacked_steps[:, 0] = now
         self._stacked_steps[self._is_new] = now[self._is_new, None]
         self._is_new[:] = False
         if self._controller:
             self._base_action[:] = np.clip(self._controller(observation), -1.0, 1.0)
-        return self._build_observation(self._stacked_steps, self._base_action)
+        return self._build_agent_observation(self._stacked_steps, self._base_action)
 
-    def observe_final(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def make_final_agent_observation(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the agent's final observation (m, size) of the `chosen` (m,) episodes.
 
         `observation` (n, o) holds the final observations. The controller is not evaluated, since
         its state belongs to the next episode already.
         """
-        now = self._append_errors(observation[chosen])[:, None]
+        now = self._append_reference_errors(observation[chosen])[:, None]
         past = np.concatenate([now, self._stacked_steps[chosen, :-1]], axis=1)
-        return self._build_observation(past, self._base_action[chosen])
+        return self._build_agent_observation(past, self._base_action[chosen])
 
-    def convert_action(self, action: np.ndarray) -> np.ndarray:
+    def make_environment_action(self, action: np.ndarray) -> np.ndarray:
         """Return the environment actions (n, a) for the actions of the agent (n, a)."""
         own = self._max_fraction * np.clip(action, -1.0, 1.0)
         return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
@@ -159,7 +159,7 @@ class StableVecEnv(_VecEnvBase):
         if VecEnv is None:
             message = "needs stable-baselines3: pip install 'hydrotele[learn]'"
             raise InputError("StableVecEnv", message)
-        self.core, self.view = make_core(task, options, num_envs, threads, SAME_STEP), view
+        self.core, self.view = make_task_core(task, options, num_envs, threads, SAME_STEP), view
         self.render_mode = None
         space = make_observation_space(self.core)
         if view:
@@ -182,7 +182,7 @@ class StableVecEnv(_VecEnvBase):
         self._return[:], self._length[:] = 0.0, 0
         if self.view:
             self.view.begin(self.num_envs)
-            return self.view.observe(self.core.observation)
+            return self.view.make_agent_observation(self.core.observation)
         return self.core.observation.copy()
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -204,7 +204,7 @@ class StableVecEnv(_VecEnvBase):
             task measures; the others are empty.
         """
         core, view = self.core, self.view
-        core.step(view.convert_action(self._pending_actions) if view else self._pending_actions)
+        core.step(view.make_environment_action(self._pending_actions) if view else self._pending_actions)
         self._return += core.reward
         self._length += 1
         over = (core.terminated | core.truncated) != 0
@@ -215,11 +215,13 @@ class StableVecEnv(_VecEnvBase):
         if len(ended):
             self._write_final_infos(
                 ended,
-                view.observe_final(core.final_observation, ended) if view else core.final_observation[ended],
+                view.make_final_agent_observation(core.final_observation, ended)
+                if view
+                else core.final_observation[ended],
             )
             if view:
                 view.reset(over)
-        seen = view.observe(core.observation) if view else core.observation.copy()
+        seen = view.make_agent_observation(core.observation) if view else core.observation.copy()
         return seen, core.reward.astype(np.float32), over, self._infos
 
     def _write_final_infos(self, ended: np.ndarray, last: np.ndarray) -> None:

@@ -25,20 +25,28 @@ from hydrotele.envs.grade import (
     MAX_RADIUS,
     MIN_RADIUS,
     PROFILE_START,
-    plane_height,
+    target_plane_height,
 )
 from hydrotele.envs.line import SETTLE_TIME, compute_line_pose
 from hydrotele.envs.place import GOAL_POSE, LOG_HALF_LENGTH, LOG_RADIUS
-from hydrotele.envs.track import track_reference
+from hydrotele.envs.track import compute_axis_reference
 from hydrotele.kinematics.task import (
     BASE_RADIUS,
     BOOM_LENGTH,
     LATERAL_OFFSET,
     STICK_LENGTH,
     TOOL_ALONG,
-    task_forward,
+    compute_tip_pose,
 )
-from hydrotele.show.canvas import Canvas, Marker, arrow, ball, box, line, polyline
+from hydrotele.show.canvas import (
+    Canvas,
+    Marker,
+    make_arrow_marker,
+    make_ball_marker,
+    make_box_marker,
+    make_line_marker,
+    make_polyline_markers,
+)
 from hydrotele.show.pose import compile_visual_model
 from hydrotele.simulate.fleet import STATE_KIND
 from hydrotele.soil.facts import CAT215
@@ -54,7 +62,7 @@ def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def bed_markers(core: TaskCore, number: int) -> list[Marker]:
+def make_soil_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return boxes for the cells of the soil profile of an episode.
 
     Args:
@@ -69,17 +77,17 @@ def bed_markers(core: TaskCore, number: int) -> list[Marker]:
     side, half = float(core.parameters["arm"][LATERAL_OFFSET]), 0.5 * CAT215.width
     bottom = min(0.0, float(np.min(surface)) - _MIN_LOOSE_THICKNESS)  # 0 is the level of the tracks
 
-    def cell(i: int, low: float, high: float, colour) -> Marker:
+    def make_cell_box(i: int, low: float, high: float, colour) -> Marker:
         middle = turn @ [PROFILE_START + (i + 0.5) * CELL_LENGTH, side, 0.5 * (low + high)]
-        return box(middle, (0.5 * CELL_LENGTH, half, 0.5 * (high - low)), colour, turn)
+        return make_box_marker(middle, (0.5 * CELL_LENGTH, half, 0.5 * (high - low)), colour, turn)
 
     bank = surface - loose
-    boxes = [cell(i, bottom, float(bank[i]), _BANK_COLOUR) for i in range(CELL_COUNT)]
+    boxes = [make_cell_box(i, bottom, float(bank[i]), _BANK_COLOUR) for i in range(CELL_COUNT)]
     heaps = [i for i in range(CELL_COUNT) if loose[i] > _MIN_LOOSE_THICKNESS]
-    return boxes + [cell(i, float(bank[i]), float(surface[i]), _LOOSE_COLOUR) for i in heaps]
+    return boxes + [make_cell_box(i, float(bank[i]), float(surface[i]), _LOOSE_COLOUR) for i in heaps]
 
 
-def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
+def make_target_plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
     """Return the outline of the target plane over the ground to grade.
 
     Args:
@@ -93,7 +101,7 @@ def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
     goal, turn = core.episodes["goal"][number], _house_rotation(core, number)
     side, out = float(core.parameters["arm"][LATERAL_OFFSET]), 0.5 * CAT215.width + 0.03
     corners = [
-        turn @ [r, side + y, plane_height.py_func(goal, r)]
+        turn @ [r, side + y, target_plane_height.py_func(goal, r)]
         for r, y in (
             (MIN_RADIUS, -out),
             (MAX_RADIUS, -out),
@@ -102,7 +110,7 @@ def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
             (MIN_RADIUS, -out),
         )
     ]
-    return polyline(np.array(corners), 0.02, colour)
+    return make_polyline_markers(np.array(corners), 0.02, colour)
 
 
 _GOAL_COLOUR = (0.10, 0.75, 0.25, 1.0)  # colour of the reference
@@ -118,7 +126,7 @@ _ARROW_DISTANCE = 0.3  # m between the arrows of two forces
 _POINTER_LENGTH = 0.8  # m, length of the line that shows an attitude
 
 
-def goal_markers(core: TaskCore, number: int) -> list[Marker]:
+def make_goal_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return the markers of the goal of an episode; none for an unknown kind of task.
 
     Args:
@@ -132,33 +140,33 @@ def goal_markers(core: TaskCore, number: int) -> list[Marker]:
     return draw(core, number) if draw else []
 
 
-def pose_position(pose: np.ndarray) -> np.ndarray:
+def pose_to_cartesian_position(pose: np.ndarray) -> np.ndarray:
     """Return the Cartesian position (3,) [m] of a tip pose (r [m], theta [rad], z [m], ...)."""
     return np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
 
 
-def _track_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_track_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the reference tip position, its future path and the tip error."""
     episode, k = core.episodes[number], core.setup.arm_axes
     now = float(episode["tick"]) * core.setup.clock.period
 
-    def place(time: float) -> np.ndarray:
+    def tip_position_at(time: float) -> np.ndarray:
         joints, pose = np.empty(k), np.empty(MAX_ARM_AXES)
         for axis in range(k):
-            joints[axis] = track_reference(episode["goal"], axis, time)[0]
-        task_forward(core.parameters["arm"], joints, pose)
-        return pose_position(pose)
+            joints[axis] = compute_axis_reference(episode["goal"], axis, time)[0]
+        compute_tip_pose(core.parameters["arm"], joints, pose)
+        return pose_to_cartesian_position(pose)
 
-    way = np.array([place(now + ahead) for ahead in np.linspace(0.0, _PREVIEW_TIME, _PATH_SEGMENTS + 1)])
-    off = line(episode["tip"], way[0], _THICK_WIDTH, _ERROR_COLOUR)
+    way = np.array([tip_position_at(now + ahead) for ahead in np.linspace(0.0, _PREVIEW_TIME, _PATH_SEGMENTS + 1)])
+    off = make_line_marker(episode["tip"], way[0], _THICK_WIDTH, _ERROR_COLOUR)
     return [
-        ball(way[0], _BALL_RADIUS, _GOAL_COLOUR),
+        make_ball_marker(way[0], _BALL_RADIUS, _GOAL_COLOUR),
         off,
-        *polyline(way, _THIN_WIDTH, _PATH_COLOUR),
+        *make_polyline_markers(way, _THIN_WIDTH, _PATH_COLOUR),
     ]
 
 
-def _line_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_line_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the line, the reference position on it and the tip error."""
     episode = core.episodes[number]
     now, pose, rate = (
@@ -167,22 +175,22 @@ def _line_markers(core: TaskCore, number: int) -> list[Marker]:
         np.zeros(MAX_ARM_AXES),
     )
 
-    def place(time: float) -> np.ndarray:
+    def line_position_at(time: float) -> np.ndarray:
         compute_line_pose(episode["goal"], time, pose, rate)
-        return pose_position(pose)
+        return pose_to_cartesian_position(pose)
 
     end = core.setup.clock.horizon * core.setup.clock.ticks * core.setup.clock.period
-    way = np.array([place(time) for time in np.linspace(SETTLE_TIME, end, _PATH_SEGMENTS + 1)])
-    wanted = place(now)
-    off = line(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR)
+    way = np.array([line_position_at(time) for time in np.linspace(SETTLE_TIME, end, _PATH_SEGMENTS + 1)])
+    wanted = line_position_at(now)
+    off = make_line_marker(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR)
     return [
-        ball(wanted, _BALL_RADIUS, _GOAL_COLOUR),
+        make_ball_marker(wanted, _BALL_RADIUS, _GOAL_COLOUR),
         off,
-        *polyline(way, _THIN_WIDTH, _PATH_COLOUR),
+        *make_polyline_markers(way, _THIN_WIDTH, _PATH_COLOUR),
     ]
 
 
-def _force_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_force_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return arrows on the plate for the reference force and the measured force."""
     episode, side = core.episodes[number], np.array([0.0, 0.5 * _ARROW_DISTANCE, 0.0])
     goal, foot = episode["goal"], episode["tip"] - np.array([0.6, 0.0, 0.0])
@@ -191,31 +199,31 @@ def _force_markers(core: TaskCore, number: int) -> list[Marker]:
     up = np.array([0.0, 0.0, _ARROW_LENGTH_PER_NEWTON])
     pushes = ((wanted, -side, _GOAL_COLOUR), (float(goal[MEASURED_FORCE]), side, _ERROR_COLOUR))
     return [
-        arrow(foot + way + max(0.0, force) * up, foot + way, 1.5 * _THICK_WIDTH, colour)
+        make_arrow_marker(foot + way + max(0.0, force) * up, foot + way, 1.5 * _THICK_WIDTH, colour)
         for force, way, colour in pushes
     ]
 
 
-def _reach_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_reach_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the goal position, the tip error and the goal attitude."""
     episode = core.episodes[number]
     pose = episode["goal"][:MAX_ARM_AXES]
-    wanted, level = pose_position(pose), math.cos(pose[3])
+    wanted, level = pose_to_cartesian_position(pose), math.cos(pose[3])
     ahead = np.array([level * math.cos(pose[1]), level * math.sin(pose[1]), math.sin(pose[3])])
-    pointer = line(wanted - _POINTER_LENGTH * ahead, wanted, _THICK_WIDTH, _PATH_COLOUR)
+    pointer = make_line_marker(wanted - _POINTER_LENGTH * ahead, wanted, _THICK_WIDTH, _PATH_COLOUR)
     return [
-        ball(wanted, _BALL_RADIUS, _GOAL_COLOUR),
-        line(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR),
+        make_ball_marker(wanted, _BALL_RADIUS, _GOAL_COLOUR),
+        make_line_marker(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR),
         pointer,
     ]
 
 
-def _grade_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_grade_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the soil and of the target plane."""
-    return [*bed_markers(core, number), *plane_markers(core, number, _GOAL_COLOUR)]
+    return [*make_soil_markers(core, number), *make_target_plane_markers(core, number, _GOAL_COLOUR)]
 
 
-def _place_markers(core: TaskCore, number: int) -> list[Marker]:
+def _make_place_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the axis and the outline of the log at its goal on the ground."""
     x, y, yaw = core.episodes[number]["goal"][GOAL_POSE]
     radius, half = (
@@ -226,17 +234,17 @@ def _place_markers(core: TaskCore, number: int) -> list[Marker]:
     aside = radius * np.array([-math.sin(yaw), math.cos(yaw), 0.0])
     middle = np.array([x, y, 0.02])
     ends = [middle + half * a * way + b * aside for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-    rim = polyline(np.array([*ends, ends[0]]), 0.03, _GOAL_COLOUR)
-    return [*rim, line(middle - half * way, middle + half * way, 0.03, _GOAL_COLOUR)]
+    rim = make_polyline_markers(np.array([*ends, ends[0]]), 0.03, _GOAL_COLOUR)
+    return [*rim, make_line_marker(middle - half * way, middle + half * way, 0.03, _GOAL_COLOUR)]
 
 
 _MARKER_FUNCTIONS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
-    "track": _track_markers,
-    "line": _line_markers,
-    "force": _force_markers,
-    "reach": _reach_markers,
-    "grade": _grade_markers,
-    "place": _place_markers,
+    "track": _make_track_markers,
+    "line": _make_line_markers,
+    "force": _make_force_markers,
+    "reach": _make_reach_markers,
+    "grade": _make_grade_markers,
+    "place": _make_place_markers,
 }
 
 
@@ -301,14 +309,14 @@ class TaskRenderer:
         """
         variant = int(self._core.episodes["variant"][number])
         if (wanted := self._get_visual_model(variant)) is not self._current_model:
-            copy_parameters(wanted, self.model)
+            copy_model_parameters(wanted, self.model)
             self._current_model = wanted
         mujoco.mj_setState(self.model, self.data, self._core.simulations.state[number], STATE_KIND)
         mujoco.mj_forward(self.model, self.data)
 
-    def markers(self, number: int = 0) -> list[Marker]:
+    def make_markers(self, number: int = 0) -> list[Marker]:
         """Return the markers of the goal of a simulation."""
-        return goal_markers(self._core, number)
+        return make_goal_markers(self._core, number)
 
     def find_camera(self, which: Camera = None) -> mujoco.MjvCamera:
         """Return a camera by name or number.
@@ -357,7 +365,7 @@ class TaskRenderer:
                 self.close()
                 self._canvas = Canvas(self.model, width, height)
             self.update(number)
-            return self._canvas.draw(self.model, self.data, view, self.markers(number))
+            return self._canvas.draw(self.model, self.data, view, self.make_markers(number))
 
     def close(self) -> None:
         """Free the OpenGL context."""
@@ -366,7 +374,7 @@ class TaskRenderer:
             self._canvas = None
 
 
-def copy_parameters(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
+def copy_model_parameters(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
     """Copy the parameters of a model to another model of the same structure.
 
     Args:

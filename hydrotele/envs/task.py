@@ -1,6 +1,6 @@
 """Definition of a task, the options of a user, and helpers that several tasks use.
 
-`draw_start` draws a start pose that lies well inside the workspace. `path_effort` checks that a
+`sample_start_positions` draws a start pose that lies well inside the workspace. `compute_path_effort` checks that a
 straight path of the tip stays in the workspace and within the rates of the drives.
 """
 
@@ -16,7 +16,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES
 from hydrotele.envs.world import ObservationField
-from hydrotele.kinematics.task import REACHED, task_forward, task_inverse, task_rates
+from hydrotele.kinematics.task import REACHED, compute_joint_rates, compute_tip_pose, solve_joint_angles
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo, SurroundingObject
 
@@ -111,7 +111,7 @@ _MAX_DRAWS = 1000  # maximum number of draws of a start pose
 _START_MARGIN = 0.08  # rad, minimum distance to the limits of the joint ranges
 
 
-def draw_start(
+def sample_start_positions(
     machine: Machine, rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]
 ) -> dict[str, float]:
     """Draw a pose of the tip within bounds and return the positions of the arm axes.
@@ -134,7 +134,7 @@ def draw_start(
     for _ in range(_MAX_DRAWS):
         pose[: len(low)] = rng.uniform(low, high)
         if (
-            task_inverse(numbers, pose, pose[1], joints) == REACHED
+            solve_joint_angles(numbers, pose, pose[1], joints) == REACHED
             and ((ranges[:, 0] + _START_MARGIN <= joints) & (joints <= ranges[:, 1] - _START_MARGIN)).all()
         ):
             return dict(zip(axes, joints.tolist(), strict=True))
@@ -146,7 +146,7 @@ _PATH_MARGIN = 0.03  # rad, minimum distance of a path to the limits of the join
 
 
 @compiled
-def path_effort(f, start, change):
+def compute_path_effort(f, start, change):
     """Return the maximum drive effort along a straight path of the tip that takes 1 s.
 
     The effort is the sum of the axis rates, each relative to its rate at full action. The sum
@@ -169,12 +169,12 @@ def path_effort(f, start, change):
     for n in range(_PATH_SEGMENTS + 1):
         for c in range(MAX_ARM_AXES):
             pose[c] = start[c] + change[c] * n / _PATH_SEGMENTS
-        if task_inverse(f.arm, pose, pose[1], q) != 0:
+        if solve_joint_angles(f.arm, pose, pose[1], q) != 0:
             return np.inf
         for i in range(k):
             if not f.ranges[i, 0] + _PATH_MARGIN <= q[i] <= f.ranges[i, 1] - _PATH_MARGIN:
                 return np.inf
-        if task_rates(f.arm, q, pose, change, rates) != 0:
+        if compute_joint_rates(f.arm, q, pose, change, rates) != 0:
             return np.inf
         effort = 0.0
         for i in range(k):
@@ -184,7 +184,7 @@ def path_effort(f, start, change):
 
 
 @compiled
-def measure_pose(f, e, pose):
+def compute_measured_pose(f, e, pose):
     """Compute the pose of the tip from the measured joint positions.
 
     Args:
@@ -197,7 +197,7 @@ def measure_pose(f, e, pose):
 
     Source: `kinematics.task.task_forward`.
     """
-    task_forward(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
 
 
 @compiled

@@ -17,15 +17,15 @@ from hydrotele.envs.world import (
     REWARD,
     TASK_SIGNATURE,
     ObservationField,
-    episode_records,
+    episode_states_view,
+    make_position_observation_field,
+    make_rate_observation_field,
     observation_view,
-    parameters_view,
-    position_field,
-    rate_field,
     simulation_view,
-    store_outcome,
+    store_episode_end,
+    task_parameters_view,
 )
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 
 PREVIEW_TIMES = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
@@ -45,18 +45,18 @@ _SINE = _BASE + MAX_AXES
 _COSINE = _SINE + _HARMONIC_COUNT * MAX_AXES
 
 
-def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `observe_track` writes: references, their rates and previews."""
-    fields = [position_field(machine, name, "reference") for name in axes]
-    fields += [rate_field(machine, name, "reference_rate") for name in axes]
+def list_track_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_track_observation` writes: references, their rates and previews."""
+    fields = [make_position_observation_field(machine, name, "reference") for name in axes]
+    fields += [make_rate_observation_field(machine, name, "reference_rate") for name in axes]
     for ahead in PREVIEW_TIMES:
         label = f"reference_in_{ahead * 1000:.0f}_ms"
-        fields += [position_field(machine, name, label) for name in axes]
+        fields += [make_position_observation_field(machine, name, label) for name in axes]
     return fields
 
 
 @compiled
-def begin_track(f, e):
+def draw_track_references(f, e):
     """Draw the goal of an episode: random Fourier references within the ranges and rates of the axes.
 
     Args:
@@ -91,7 +91,7 @@ def begin_track(f, e):
 
 
 @compiled
-def track_reference(g, i, time):
+def compute_axis_reference(g, i, time):
     """Return the reference position of an axis at a time, and its rate.
 
     Args:
@@ -124,7 +124,7 @@ def track_reference(g, i, time):
 
 
 @compiled
-def observe_track(f, e, out, at):
+def write_track_observation(f, e, out, at):
     """Write the references of all axes, their rates and the references ahead to the observation.
 
     Args:
@@ -136,18 +136,18 @@ def observe_track(f, e, out, at):
     Returns:
         Nothing.
 
-    Source: `track_fields`.
+    Source: `list_track_observation_fields`.
     """
     now, n = e.tick * f.period, f.axes_driven
     for a in range(n):
         i = f.driven_axis[a]
-        out[at + a], out[at + n + a] = track_reference(e.goal, i, now)
+        out[at + a], out[at + n + a] = compute_axis_reference(e.goal, i, now)
         for p in range(len(PREVIEW_TIMES)):
-            out[at + (2 + p) * n + a] = track_reference(e.goal, i, now + PREVIEW_TIMES[p])[0]
+            out[at + (2 + p) * n + a] = compute_axis_reference(e.goal, i, now + PREVIEW_TIMES[p])[0]
 
 
 @compiled
-def reward_track(f, e, w):
+def compute_track_reward(f, e, w):
     """Compute the reward: 1 minus 1 for every 0.1 m of tip error, at least -1.
 
     Args:
@@ -163,8 +163,8 @@ def reward_track(f, e, w):
     now = e.tick * f.period
     q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
     for i in range(f.arm_axes):
-        q[i] = track_reference(e.goal, i, now)[0]
-    task_forward(f.arm, q, pose)
+        q[i] = compute_axis_reference(e.goal, i, now)[0]
+    compute_tip_pose(f.arm, q, pose)
     x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
     square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2
     error = math.sqrt(square)
@@ -173,18 +173,18 @@ def reward_track(f, e, w):
 
 
 @callback(TASK_SIGNATURE)
-def task_code(part, m, d, number, argument, out):
+def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
     The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
     mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
     """
-    f = parameters_view(argument)[0]
-    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
-        begin_track(f, e)
+        draw_track_references(f, e)
     elif part == OBSERVE:
-        observe_track(f, e, observation_view(f, out), 0)
+        write_track_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return store_outcome(e, reward_track(f, e, w))
+        return store_episode_end(e, compute_track_reward(f, e, w))
     return 0.0

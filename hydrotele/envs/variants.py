@@ -98,7 +98,7 @@ def _build_variants(task: Task, options: Options, nominal: Machine) -> Variants:
             plant = build_plant(machine, options.timestep, task.ground, things)
         machines.append(machine)
         plants.append(plant)
-        data = rest_state(plant, _to_joint_names(machine, joints))
+        data = rest_state(plant, _rename_axes_to_joints(machine, joints))
         start_leapfrog(plant.model, data)
         state = np.zeros(mujoco.mj_stateSize(plant.model, STATE_KIND))
         mujoco.mj_getState(plant.model, data, state, STATE_KIND)
@@ -107,11 +107,11 @@ def _build_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     return Variants(
         plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
         np.array(states), np.array(tips), _find_differing_fields(plants, task.written_fields),
-        *_sensor_tables(plants[0], machines), _command_delay_table(plants[0], machines),
+        *_make_sensor_error_tables(plants[0], machines), _make_command_delay_table(plants[0], machines),
     )  # fmt: skip
 
 
-def _to_joint_names(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
+def _rename_axes_to_joints(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
     """Return the positions with axis names replaced by the names of their joints."""
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
@@ -190,7 +190,7 @@ def sensor_channels(plant: Plant) -> tuple[str, ...]:
     return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
 
 
-def _sensor_tables(plant: Plant, machines: list[Machine]):
+def _make_sensor_error_tables(plant: Plant, machines: list[Machine]):
     """Return scales, offsets, delays and lag ratios of all sensors of all variants."""
     shape, names = (len(machines), MAX_CHANNELS), sensor_channels(plant)
     scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
@@ -207,7 +207,7 @@ def _sensor_tables(plant: Plant, machines: list[Machine]):
     return scales, offsets, lags, ratios
 
 
-def _command_delay_table(plant: Plant, machines: list[Machine]) -> np.ndarray:
+def _make_command_delay_table(plant: Plant, machines: list[Machine]) -> np.ndarray:
     delays = np.zeros((len(machines), MAX_AXES, 2))
     for v, machine in enumerate(machines):
         delays[v, : len(plant.axes)] = command_delays(machine, plant.axes, plant.model.opt.timestep)

@@ -1,8 +1,8 @@
 """Access of native code to a simulation, calls of the native code of a task, machine observations.
 
 `SimulationView` holds the arrays of one simulation. The native code of a task is called by address, so every
-task, and the loop that calls it, compiles separately. `observe_machine` writes the observation of
-the machine: sensors, tip pose from nominal kinematics, and commands. `machine_fields` returns the
+task, and the loop that calls it, compiles separately. `write_machine_observation` writes the observation of
+the machine: sensors, tip pose from nominal kinematics, and commands. `list_machine_observation_fields` returns the
 names, units and bounds of these values in the same order.
 """
 
@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_to_pointer, float64_view, struct_field_view
 from hydrotele.envs.episode import EPISODE_STATE, MAX_ARM_AXES, MAX_MEASURES, TASK_PARAMETERS
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 
 BEGIN, TICK, OBSERVE, REWARD = range(4)
@@ -79,13 +79,13 @@ class SimulationView(NamedTuple):
 
 
 @compiled
-def parameters_view(argument):
+def task_parameters_view(address):
     """Return a view (1,) of the TASK_PARAMETERS record at an address, scalar."""
-    return carray(address_to_pointer(argument), (1,), TASK_PARAMETERS)
+    return carray(address_to_pointer(address), (1,), TASK_PARAMETERS)
 
 
 @compiled
-def episode_records(f):
+def episode_states_view(f):
     """Return a view (count,) of the EPISODE_STATE records of a TASK_PARAMETERS record."""
     return carray(address_to_pointer(f.episodes), (f.count,), EPISODE_STATE)
 
@@ -134,7 +134,7 @@ def simulation_view(f, m, d, number, argument):
 
 
 @intrinsic
-def _call_address(typingctx, function, part, model, data, number, argument, out):
+def _call_function_at_address(typingctx, function, part, model, data, number, argument, out):
     """Call a function with the signature TASK_SIGNATURE by its address."""
 
     def codegen(context, builder, signature, args):
@@ -145,7 +145,7 @@ def _call_address(typingctx, function, part, model, data, number, argument, out)
 
 
 @compiled
-def call_task(f, w, part, out):
+def call_task_part(f, w, part, out):
     """Call one part of the task's native code for a simulation.
 
     Args:
@@ -159,7 +159,7 @@ def call_task(f, w, part, out):
 
     Source: this module.
     """
-    return _call_address(f.task, part, w.model, w.data, w.index, w.parameters_address, out)
+    return _call_function_at_address(f.task, part, w.model, w.data, w.index, w.parameters_address, out)
 
 
 @compiled
@@ -177,7 +177,7 @@ def observation_view(f, out):
 
 
 @compiled
-def store_outcome(e, outcome):
+def store_episode_end(e, outcome):
     """Store in the episode record whether the episode ends, and return the reward.
 
     Args:
@@ -217,7 +217,7 @@ class ObservationField(NamedTuple):
     high: float
 
 
-def position_field(machine: Machine, axis: str, what: str = "") -> ObservationField:
+def make_position_observation_field(machine: Machine, axis: str, what: str = "") -> ObservationField:
     """Return the observation field (name, unit, bounds) of an axis position.
 
     `what` is the quantity in the name; the default is `angle` or `position`.
@@ -228,13 +228,13 @@ def position_field(machine: Machine, axis: str, what: str = "") -> ObservationFi
     return ObservationField(f"{what or kind}.{axis}", unit, low - _POSITION_MARGIN, high + _POSITION_MARGIN)
 
 
-def rate_field(machine: Machine, axis: str, what: str = "rate") -> ObservationField:
+def make_rate_observation_field(machine: Machine, axis: str, what: str = "rate") -> ObservationField:
     """Return the observation field (name, unit, bounds) of an axis rate; `what` is the quantity in its name."""
     unit = "rad/s" if machine.position_kind(axis) == "angle" else "m/s"
     return ObservationField(f"{what}.{axis}", unit, -_RATE_BOUND, _RATE_BOUND)
 
 
-def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[ObservationField]:
+def make_pose_observation_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[ObservationField]:
     """Return the observation fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
     far = max_reach(machine)
     fields = [
@@ -254,8 +254,8 @@ def max_reach(machine: Machine) -> float:
     return sum(lengths) + float(np.linalg.norm(machine.arm.tip.position))
 
 
-def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[ObservationField]:
-    """Return the observation fields that `observe_machine` writes.
+def list_machine_observation_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[ObservationField]:
+    """Return the observation fields that `write_machine_observation` writes.
 
     Args:
         machine: the machine.
@@ -267,13 +267,13 @@ def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> li
         pressure, pose of the tip, commands.
     """
     valves = [name for name in axes if machine.axes[name].is_hydraulic]
-    fields = [position_field(machine, name) for name in axes]
-    fields += [rate_field(machine, name) for name in axes]
+    fields = [make_position_observation_field(machine, name) for name in axes]
+    fields += [make_rate_observation_field(machine, name) for name in axes]
     fields += [ObservationField(f"pressure_head.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     fields += [ObservationField(f"pressure_rod.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     if valves:
         fields.append(ObservationField("pressure_supply", "Pa", *_PRESSURE_BOUNDS))
-    fields += pose_fields(machine, arm_axes)
+    fields += make_pose_observation_fields(machine, arm_axes)
     for name in axes:
         force = machine.axes[name].force
         limit = force.command_limit if force else 1.0
@@ -283,7 +283,7 @@ def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> li
 
 
 @compiled
-def observe_machine(f, e, out):
+def write_machine_observation(f, e, out):
     """Write the measured values of the machine, the tip pose and the commands to the observation.
 
     Args:
@@ -294,7 +294,7 @@ def observe_machine(f, e, out):
     Returns:
         Number of values written, scalar.
 
-    Source: `machine_fields`.
+    Source: `list_machine_observation_fields`.
     """
     at = 0
     for a in range(f.axes_driven):
@@ -315,7 +315,7 @@ def observe_machine(f, e, out):
         out[at] = e.supply
         at += 1
     pose = np.empty(MAX_ARM_AXES)
-    task_forward(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
     for c in range(max(4, f.arm_axes)):
         out[at] = pose[c]
         at += 1

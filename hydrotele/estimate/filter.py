@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import (
     Model,
@@ -49,7 +49,7 @@ from hydrotele.hydraulics.parameters import (
     Slot,
     actuator_order,
     extra_state_names,
-    max_time_step,
+    max_pump_drive_time_step,
 )
 from hydrotele.hydraulics.pump import STALLED_SPEED
 from hydrotele.hydraulics.supply import TERM_FLOW_TIME_CONSTANT
@@ -120,7 +120,7 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
             sizes.append(abs(facts.force.gain) * facts.force.command_limit)
         else:
             pressure = machine.supply.relief_pressure if machine.supply else _USUAL_PRESSURE
-            sizes.append(pressure * facts.hydraulic_drive.areas[0])
+            sizes.append(pressure * facts.hydraulic_drive.effective_areas[0])
     return np.array(sizes)
 
 
@@ -182,7 +182,7 @@ def _pumped_column(machine: Machine, states: np.ndarray, command: np.ndarray, pe
         "parameters": {"value": size},
     })  # fmt: skip
     more = machine.model_copy(update={"terms": (*machine.terms, term)})
-    steps = max(1, math.ceil(period / min(_ROWS_STEP, max_time_step(machine, i.axis))))
+    steps = max(1, math.ceil(period / min(_ROWS_STEP, max_pump_drive_time_step(machine, i.axis))))
     ends = []
     for one in (machine, more):
         model, later = reduced_model(one, ()), np.empty(states.shape)
@@ -235,7 +235,7 @@ def input_columns(
         else:
             side = 2 if balance == "flow_head" else 3
             drive = facts.hydraulic_drive
-            volume = np.maximum(drive.volumes(position[:, i])[side - 2], drive.dead_volume)
+            volume = np.maximum(drive.chamber_volumes(position[:, i])[side - 2], drive.dead_volume)
             oil = drive.hose_compliance
             if machine.supply:
                 bubbles = np.array([
@@ -321,7 +321,7 @@ def late_readings(model: Model, period: float) -> DelayedReadings:
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def begin_delayed(late, size, shown, z):
     """Fill the late readings as if the state had rested so far.
 
@@ -340,7 +340,7 @@ def begin_delayed(late, size, shown, z):
         z[size + e] = shown[late.channel[e]]
 
 
-@allocation_free
+@compile_without_allocation
 def delayed_covariance(late, size, slope, spread):
     """Covariance of the late readings after `begin_delayed`.
 
@@ -370,7 +370,7 @@ def delayed_covariance(late, size, slope, spread):
         spread[s, s] = total + late.open[e] * total
 
 
-@allocation_free
+@compile_without_allocation
 def shift_delayed(model, late, size, trail, h, z):
     """Late readings a row later.
 
@@ -403,7 +403,7 @@ def shift_delayed(model, late, size, trail, h, z):
         z[size + e] = model.scale[c] * value + model.offset[c]
 
 
-@allocation_free
+@compile_without_allocation
 def perturb_delayed(late, place, change, readings):
     """Add to the late readings what a change of one of them makes of them a row later.
 
@@ -443,7 +443,7 @@ class Gains(NamedTuple):
     spread: np.ndarray
 
 
-@allocation_free
+@compile_without_allocation
 def _slopes(model, sp, z, nudge, slope, moved):
     """Slopes of the readings in a state that was just read."""
     first = 2 * (len(model.mech.independent) + len(model.transmission))
@@ -707,7 +707,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
     return loss
 
 
-@allocation_free
+@compile_without_allocation
 def _correct(model, sp, z, own, delta):
     """Add a correction to a state; drives that it does not know follow their loads."""
     n, t = len(model.mech.independent), len(model.transmission)
@@ -736,7 +736,7 @@ def _correct(model, sp, z, own, delta):
         _bound_memory(model, z)
 
 
-@allocation_free
+@compile_without_allocation
 def _bound_memory(model, z):
     """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
     act = z[2 * (len(model.mech.independent) + len(model.transmission)) :]
@@ -750,7 +750,7 @@ def _bound_memory(model, z):
         act[at] = min(1.0, max(0.0, act[at]))
 
 
-@allocation_free
+@compile_without_allocation
 def _keep_side(z, at, moved):
     """Undo what readings cannot say of a pump drive: that its relays switched, or its load pulls.
 
@@ -764,7 +764,7 @@ def _keep_side(z, at, moved):
     z[at + 1] = max(0.0, z[at + 1])
 
 
-@allocation_free
+@compile_without_allocation
 def _among(numbers, number):
     """Whether a number is one of (n,) numbers."""
     for other in numbers:
@@ -773,7 +773,7 @@ def _among(numbers, number):
     return False
 
 
-@allocation_free
+@compile_without_allocation
 def _carry(columns, covariance, work, drift):
     """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
     size = len(drift)

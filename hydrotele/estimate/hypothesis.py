@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from hydrotele.effects import EFFECTS, Effect, Parameter
-from hydrotele.effects.effect import lateral_directions, linkage_axes, with_value
+from hydrotele.effects.effect import lateral_directions, nonparallel_cylinder_axes, with_value
 from hydrotele.machine.machine import Machine
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
@@ -388,7 +388,7 @@ def _of_facts(machine: Machine) -> list[Number]:
 def _of_rods(machine: Machine) -> list[Number]:
     """Where rods end: their pins, and the closed lengths that their extensions count from."""
     found = []
-    for name in linkage_axes(machine):
+    for name in nonparallel_cylinder_axes(machine):
         cylinder = machine.axes[name].cylinder
         assert cylinder
         size, pin = cylinder.closed_length, cylinder.rod_pin.position

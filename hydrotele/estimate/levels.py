@@ -40,7 +40,7 @@ from hydrotele.estimate.track import (
     track_run,
 )
 from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment
-from hydrotele.machine.machine import Machine, channel_converter, channel_sensor
+from hydrotele.machine.machine import Machine, find_channel_sensor, make_channel_converter
 
 
 class LinearRun(NamedTuple):
@@ -376,7 +376,7 @@ def rough_noise(data: Dataset) -> np.ndarray:
 def _rounding(data: Dataset, channel: str) -> float:
     """Standard deviation of a converter's rounding [channel's unit]."""
     sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
-    step = channel_converter(channel_sensor(data.machine, sensors, channel), channel).step
+    step = make_channel_converter(find_channel_sensor(data.machine, sensors, channel), channel).step
     return step / 12.0**0.5
 
 

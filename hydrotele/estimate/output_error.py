@@ -38,7 +38,7 @@ from hydrotele.estimate.free_run import _run_from, _shown, following_levels
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import Levels, steps_per_row, track_run
-from hydrotele.kinematics.from_machine import range_at_drive
+from hydrotele.kinematics.from_machine import joint_range_at_drive
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.drives import FlowCurve, Metering
 from hydrotele.machine.machine import Machine
@@ -90,7 +90,7 @@ def uncertain_parameters(machine: Machine) -> Guess:
         found.append(timing(machine, axis))
         if facts.valve:
             found.append(flow_table(machine, axis))
-        if range_at_drive(machine, axis) and facts.cylinder and not facts.four_bar:
+        if joint_range_at_drive(machine, axis) and facts.cylinder and not facts.four_bar:
             found.append(linkage(machine, axis))
     if machine.supply and machine.hydraulic_axes:
         found.append(supply_limits(machine))
@@ -222,7 +222,7 @@ def linkage(machine: Machine, axis: str) -> Hypothesis:
     def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
         if not any(values.values()):
             return nominal
-        before = range_at_drive(nominal, axis)
+        before = joint_range_at_drive(nominal, axis)
         cylinder, joint = nominal.axes[axis].cylinder, nominal.axes[axis].joint
         assert cylinder and before
         name = nominal.link_of(joint)
@@ -235,7 +235,7 @@ def linkage(machine: Machine, axis: str) -> Hypothesis:
                 arm = _turned(arm, np.array(nominal.joints[joint].axis), values["angle"])
             place = tuple(float(x) for x in centre + arm)
             moved = with_value(moved, f"axes.{axis}.cylinder.{end}.position", place)
-        after = range_at_drive(moved, axis)
+        after = joint_range_at_drive(moved, axis)
         if after is None:  # the linkage would turn back within the joint's range
             return nominal
         stroke = cylinder.stroke + (after[1] - after[0]) - (before[1] - before[0])

@@ -10,22 +10,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
 from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SCRATCH_SIZE,
-    actuator_stop,
+    actuator_end_stop_force,
     add_command_terms,
-    advance_term_states,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     delivered_flow_fraction,
-    drive_state,
     force_after_friction,
+    make_drive_state,
     step_circuit,
+    write_term_state_rates,
 )
-from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
+from hydrotele.hydraulics.laws import pressure_with_released_air, pressure_without_released_air
 from hydrotele.hydraulics.parameters import (
     SLOT_COUNT,
     Slot,
@@ -236,7 +236,7 @@ def state_names(machine: Machine) -> list[str]:
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 
 
-@allocation_free
+@compile_without_allocation
 def set_activations(model, sp, z):
     """Write the activations of a state with the pressures that are felt into `sp.act`.
 
@@ -256,10 +256,10 @@ def set_activations(model, sp, z):
     for i in range(model.hydraulic):
         release, onset = model.user[i * SLOT_COUNT + _AIR], model.user[i * SLOT_COUNT + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
-            sp.act[k] = pressure_with_air(sp.act[k], release, onset)
+            sp.act[k] = pressure_with_released_air(sp.act[k], release, onset)
 
 
-@allocation_free
+@compile_without_allocation
 def store_activations(model, sp, z):
     """Write `sp.act` back into a state, the inverse of `set_activations`.
 
@@ -279,10 +279,10 @@ def store_activations(model, sp, z):
     for i in range(model.hydraulic):
         release, onset = model.user[i * SLOT_COUNT + _AIR], model.user[i * SLOT_COUNT + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
-            z[first + k] = pressure_without_air(sp.act[k], release, onset)
+            z[first + k] = pressure_without_released_air(sp.act[k], release, onset)
 
 
-@allocation_free
+@compile_without_allocation
 def supply_of(model, sp, z):
     """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `set_activations`.
 
@@ -290,12 +290,12 @@ def supply_of(model, sp, z):
     """
     user, count, act = model.user, model.hydraulic, sp.act
     set_activations(model, sp, z)
-    compute_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
+    compute_inlet_conditions(user, act, act, sp.scratch, 0, count, 0.0, act)
     share = 1.0 if model.memory < 0 else delivered_flow_fraction(user, 0, act)
     return circuit_supply_pressure(user, 0, count, sp.scratch, share)
 
 
-@allocation_free
+@compile_without_allocation
 def term_force(model, sp, z, i, velocity):
     """Force that the terms add to a drive, and its slope with respect to the drive's velocity.
 
@@ -314,7 +314,7 @@ def term_force(model, sp, z, i, velocity):
     if not (commanded or has_term(model.terms, ON_FORCE, i)):
         return 0.0, 0.0
     supply = supply_of(model, sp, z) if count > 0 else 0.0
-    s = drive_state(
+    s = make_drive_state(
         model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
         sp.drive[COMMAND, i], model.gain[i],
     )  # fmt: skip
@@ -327,7 +327,7 @@ def term_force(model, sp, z, i, velocity):
     return force, slope
 
 
-@allocation_free
+@compile_without_allocation
 def add_commands(model, sp, h):
     """Write the commands that the valves are given: what arrives and what the terms add.
 
@@ -345,7 +345,7 @@ def add_commands(model, sp, h):
     add_command_terms(model.user, model.terms, drives, h, sp.time[0], sp.scratch, drive[GIVEN])
 
 
-@allocation_free
+@compile_without_allocation
 def is_lagged(model, c):
     """Whether a channel shows the past: through a delay or a first-order lag.
 
@@ -361,7 +361,7 @@ def is_lagged(model, c):
     return model.lag[c] > 0.0 or model.time_constant[c] > 0.0
 
 
-@allocation_free
+@compile_without_allocation
 def follow_channel(trail, c, ratio, shown):
     """Replace what an ideal sensor shows over a row by what one with a first-order lag shows.
 
@@ -387,7 +387,7 @@ def follow_channel(trail, c, ratio, shown):
     return shown
 
 
-@allocation_free
+@compile_without_allocation
 def follow_trail(model, trail, h, shown):
     """`follow_channel` for every channel with a first-order lag.
 
@@ -411,7 +411,7 @@ _AH, _AR, _OFFSET = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.OFFSET)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 
 
-@allocation_free
+@compile_without_allocation
 def place(model, sp, z):
     """Put mechanism and drives at a state: `place_mechanism`, and the pressures that are felt.
 
@@ -429,7 +429,7 @@ def place(model, sp, z):
     set_activations(model, sp, z)
 
 
-@allocation_free
+@compile_without_allocation
 def place_mechanism(model, sp, z):
     """Put the mechanism at a state: frames, drive positions and their Jacobian rows.
 
@@ -475,7 +475,7 @@ def place_mechanism(model, sp, z):
         sp.drive[X, i] = load_position(model, sp, i) if gear < 0 else z[n + gear]
 
 
-@allocation_free
+@compile_without_allocation
 def load_position(model, sp, i):
     """Position of a drive's load side, scalar [m] or [rad], at the state of the last `place`.
 
@@ -487,7 +487,7 @@ def load_position(model, sp, i):
     return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.link_count + 2 * bar, CLOSED_LENGTH]
 
 
-@allocation_free
+@compile_without_allocation
 def accelerate(model, sp, z, dt):
     """Linearly implicit acceleration over a kick; leaves the mechanism where `place` put it.
 
@@ -553,7 +553,7 @@ def accelerate(model, sp, z, dt):
             for f in range(n):
                 sp.mass[n + gear, f] -= slope * sp.row[i, f]
         at = sp.drive[X, i] if gear < 0 else load_position(model, sp, i)
-        stop, stiff, damped = actuator_stop(user, u, at, v)
+        stop, stiff, damped = actuator_end_stop_force(user, u, at, v)
         push += stop
         slope += half * (damped + half * stiff)
         for f in range(n):
@@ -564,7 +564,7 @@ def accelerate(model, sp, z, dt):
     solve_cholesky(sp.mass, sp.force)
 
 
-@allocation_free
+@compile_without_allocation
 def _drive_velocity(model, sp, z, i):
     """Velocity of a drive, its own where it has a transmission, scalar [m/s] or [rad/s]."""
     n, first = len(model.mech.independent), len(model.mech.independent) + len(model.transmission)
@@ -576,7 +576,7 @@ def _drive_velocity(model, sp, z, i):
     return v
 
 
-@allocation_free
+@compile_without_allocation
 def _inertia(model, sp, i):
     """Inertia that a drive moves while the others rest, scalar [kg] or [kg m^2]."""
     if model.gear[i] >= 0:
@@ -589,7 +589,7 @@ def _inertia(model, sp, i):
     return least
 
 
-@allocation_free
+@compile_without_allocation
 def _project(facts, tree_mass, joint, basis, half, n, mass, force):
     """Mass matrix and forces of the tree with its dampers, in independent coordinates."""
     nt = len(tree_mass)
@@ -620,7 +620,7 @@ def _project(facts, tree_mass, joint, basis, half, n, mass, force):
                 mass[f, g] += basis[j, f] * total
 
 
-@allocation_free
+@compile_without_allocation
 def arriving(command, row, begin, end, period, delay):
     """Mean of a held and delayed command over part of a row.
 
@@ -654,7 +654,7 @@ def arriving(command, row, begin, end, period, delay):
     return total / (stop - place)
 
 
-@allocation_free
+@compile_without_allocation
 def advance(model, sp, z, command, row, period, steps, trail):
     """Advance a state over one row of a log.
 
@@ -711,7 +711,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             )  # fmt: skip
             if model.memory >= 0 and len(model.terms) > 0:
                 drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
-                advance_term_states(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
+                write_term_state_rates(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
         if model.memory >= 0:
@@ -727,7 +727,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             write_trail(model, sp, z, trail[step + 1])
 
 
-@allocation_free
+@compile_without_allocation
 def _bend(user, act, drive, h, act_dot):
     """Rates of all bristles over a step in which the drives' velocities are held."""
     for i in range(drive.shape[1]):
@@ -737,7 +737,7 @@ def _bend(user, act, drive, h, act_dot):
             act_dot[at] = bristle_rate(user, u, act[at], drive[V, i], drive[INERTIA, i], h)
 
 
-@allocation_free
+@compile_without_allocation
 def _take_commands(model, drive, command, row, begin, end, period):
     """Commands that arrive over part of a row."""
     for i in range(len(model.delay)):
@@ -747,7 +747,7 @@ def _take_commands(model, drive, command, row, begin, end, period):
             drive[COMMAND, i] = arriving(command[:, i], row, begin, end, period, model.delay[i])
 
 
-@allocation_free
+@compile_without_allocation
 def write_trail(model, sp, z, out):
     """Keep what the late channels would show in a state if they were not, after `place`.
 
@@ -767,7 +767,7 @@ def write_trail(model, sp, z, out):
             out[c] = _shown(model, sp, z, c)
 
 
-@allocation_free
+@compile_without_allocation
 def _shown(model, sp, z, c):
     """What an ideal sensor of a channel shows, after `place`."""
     kind, i = model.kind[c], model.drive[c]
@@ -780,7 +780,7 @@ def _shown(model, sp, z, c):
     return sp.act[4 * i + kind]
 
 
-@allocation_free
+@compile_without_allocation
 def read_channels(model, sp, z, row, steps, h, trail, out):
     """What the sensors show in a state, without noise and drift.
 
@@ -814,7 +814,7 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
         out[c] = model.scale[c] * value + model.offset[c]
 
 
-@allocation_free
+@compile_without_allocation
 def add_sensor_drift(model, time, out):
     """Add to what the sensors show by how much their offsets have drifted.
 

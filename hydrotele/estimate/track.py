@@ -45,13 +45,13 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     state_names,
 )
-from hydrotele.hydraulics.circuit import circuit_scratch, compute_ports, demanded_flow_fraction
+from hydrotele.hydraulics.circuit import circuit_scratch, compute_inlet_conditions, demanded_flow_fraction
 from hydrotele.hydraulics.parameters import (
     DELIVERY_STATE,
     SLOT_COUNT,
     Slot,
     actuator_order,
-    max_time_step,
+    max_pump_drive_time_step,
 )
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
@@ -126,7 +126,7 @@ def _drawn(model: Model, state: np.ndarray) -> float:
     """Share of its flow that a pump gives whose valves have stood where they stand."""
     act = state[2 * (len(model.mech.independent) + len(model.transmission)) :]
     ports = circuit_scratch()
-    compute_ports(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
+    compute_inlet_conditions(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
     return demanded_flow_fraction(model.user, 0, model.hydraulic, ports)
 
 
@@ -309,7 +309,7 @@ def fine_enough(machine: Machine, step: float) -> float:
         max(_STIFF, _RADIAN / natural_frequency(machine, name))
         for name, axis in machine.axes.items() if axis.transmission
     ]  # fmt: skip
-    rigid = [max_time_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
+    rigid = [max_pump_drive_time_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
     return min([step, *springs, *rigid])
 
 

@@ -31,10 +31,10 @@ from hydrotele.experiments.comparison import (
     merge_settings,
 )
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
@@ -66,7 +66,7 @@ HINGES = ("alpha", "beta")
 
 
 @cache
-def load_complete_setup() -> RegressorSetup:
+def load_complete_friction_setup() -> RegressorSetup:
     """Return the regressor setup with separate dry and viscous friction parameters of every passive hinge."""
     mapping, folder = load_robot().mechanism.mapping, models_folder() / "palida"
     complete = ColumnMapping(
@@ -78,20 +78,20 @@ def load_complete_setup() -> RegressorSetup:
     return load_mechanism(folder / "palida.xml", complete).setup
 
 
-def build_complete_regressor(motion: np.ndarray) -> Regressor:
+def build_complete_friction_regressor(motion: np.ndarray) -> Regressor:
     """Compute the regressor with separate friction parameters of every passive hinge along a motion.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations of the platform.
 
     Returns:
-        The regressor of the drive forces, with the setup of `load_complete_setup`.
+        The regressor of the drive forces, with the setup of `load_complete_friction_setup`.
     """
-    setup = load_complete_setup()
+    setup = load_complete_friction_setup()
     return setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *motion))
 
 
-def measure_reduction(seed: int, changes: Changes) -> Sample:
+def measure_friction_reduction(seed: int, changes: Changes) -> Sample:
     """Reduce the friction model of the passive joints to the parameters that the data can identify.
 
     The passive joints start with 24 parameters of dry and viscous friction. Insignificant parameters
@@ -109,7 +109,7 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
     settings = merge_settings({"hinge_scatter": 0.0}, changes)
     cycle = simulate_excitation()
     if settings["hinge_scatter"]:
-        full = build_complete_regressor(cycle.motion)
+        full = build_complete_friction_regressor(cycle.motion)
         scatter = np.array([
             settings["hinge_scatter"] * value * (-1.0) ** int(name[-1])
             if name.startswith("coulomb") and _is_passive(name) else 0.0
@@ -118,7 +118,7 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
         cycle = cycle._replace(force=cycle.force + full.matrix @ scatter)
     record = simulate_measurement(cycle, PERIODS_PER_TRIAL, np.random.default_rng([22, seed]))
     data = average_periods(record, cycle.period)
-    table = build_complete_regressor(data.motion)
+    table = build_complete_friction_regressor(data.motion)
     names = [one.column for one in PUBLISHED_PARAMETERS[:10]]
     names += [name for name in table.names if name.startswith(("coulomb", "viscous"))]
     columns = [table.names.index(name) for name in names]
@@ -152,7 +152,7 @@ def _is_passive(name: str) -> bool:
     return name.partition(".")[2].startswith(HINGES)
 
 
-def evaluate_reduction(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_friction_reduction(samples: Sequence[Sample]) -> Evaluation:
     """Check that most simulated data sets lead to the published friction model of the passive joints.
 
     In this model all joints of one kind share one dry friction parameter.
@@ -170,7 +170,7 @@ def evaluate_reduction(samples: Sequence[Sample]) -> Evaluation:
 
 REDUCTION = Experiment(
     "friction of the passive joints",
-    measure_reduction,
+    measure_friction_reduction,
     (
         Claim(
             "friction of the passive joints",
@@ -178,7 +178,7 @@ REDUCTION = Experiment(
             ' with high correlation are replaced by a common parameter." "Friction in the passive'
             " joints is modelled only as dry friction with a common parameter for all"
             ' αj and another one for all βj -joints."',
-            "Table 1, sections 2.2 and 5.1", "document", evaluate_reduction,
+            "Table 1, sections 2.2 and 5.1", "document", evaluate_friction_reduction,
             {"hinge_scatter": 0.5}, "dry friction of hinges of one kind differs by 50 %",
         ),
     ),
@@ -188,7 +188,7 @@ REDUCTION = Experiment(
 # Excitation, sections 3 and 5.2.
 
 
-def measure_design(seed: int, changes: Changes) -> Sample:
+def compare_excitation_with_random(seed: int, changes: Changes) -> Sample:
     """Compare the precision of the designed excitation motion with that of a random one.
 
     The random motion is scaled to the same limits of pose and drives.
@@ -215,7 +215,7 @@ def measure_design(seed: int, changes: Changes) -> Sample:
         if compute_limit_utilization(other, time) <= 1.0:
             break
         other = replace(other, sin=0.95 * other.sin, cos=0.95 * other.cos)
-    designed, random = (_compute_log_information(one, time) for one in (best, other))
+    designed, random = (_compute_information_log_determinant(one, time) for one in (best, other))
     motion = best.evaluate(time)[0]
     values = {
         "ratio": float(np.exp(0.5 * (designed - random) / len(PUBLISHED_PARAMETERS))),
@@ -242,22 +242,22 @@ def compute_limit_utilization(motion: Excitation, time: np.ndarray) -> float:
     return float(make_drive_limits().compute_utilisation(whole, np.stack([inside, whole[1], whole[2]])).max())
 
 
-def _compute_log_information(motion: Excitation, time: np.ndarray) -> float:
+def _compute_information_log_determinant(motion: Excitation, time: np.ndarray) -> float:
     own = load_robot()
     base = own.base_parameters.base[own.order]
     held = compute_information(own.setup, motion.evaluate(time), compute_force_covariance(), base)
     return float(np.linalg.slogdet(held)[1])
 
 
-def evaluate_design(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_designed_excitation(samples: Sequence[Sample]) -> Evaluation:
     """Check that the designed excitation is more precise than random ones and stays within its limits."""
     return Evaluation(
         (
-            check_statistic(
+            check_bootstrapped_statistic(
                 "standard deviations with random motions over those with the designed one",
                 collect_values(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
                 (1.0, np.inf), "the designed motion is more precise"),
-            check_exact("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
+            check_deterministic_value("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
         ),
         note=f"ln det of the information {samples[0].values['designed']:.1f}; of the best random"
         f" motion {collect_values(samples, 'random').max():.1f}",
@@ -266,13 +266,13 @@ def evaluate_design(samples: Sequence[Sample]) -> Evaluation:
 
 DESIGN = Experiment(
     "excitation",
-    measure_design,
+    compare_excitation_with_random,
     (
         Claim(
             "D-optimal excitation",
             '"it is recommended to opt for the D-optimal design" "for experimental identification'
             ' just a sufficiently good excitation trajectory is needed"; five harmonics',
-            "Fig. 5, (22) to (26), section 5.2", "document", evaluate_design,
+            "Fig. 5, (22) to (26), section 5.2", "document", evaluate_designed_excitation,
             {"amplitude": 0.1}, "the amplitude of the motion is scaled by 0.1",
         ),
     ),
@@ -285,7 +285,7 @@ STRATEGIES = ("linear control", "nominal feedforward", "identified feedforward")
 PATH_PLANNERS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "square": plan_square}
 
 
-def measure_control(seed: int, changes: Changes) -> Sample:
+def measure_tracking_errors(seed: int, changes: Changes) -> Sample:
     """Simulate path tracking with three control strategies on a circle and a square at four speeds.
 
     The strategies are linear control alone, with feedforward of nominal parameters, and with
@@ -343,7 +343,7 @@ def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation
     feedforward of identified parameters must reduce it further.
 
     Args:
-        samples: samples of `measure_control`.
+        samples: samples of `measure_tracking_errors`.
         path: `circle` or `square`.
     """
     if collect_values(samples, "warnings").any():
@@ -382,11 +382,11 @@ def evaluate_square_errors(samples: Sequence[Sample]) -> Evaluation:
     return evaluate_actuator_errors(samples, "square")
 
 
-def evaluate_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluation:
+def evaluate_errors_at_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluation:
     """Check that identified feedforward gives smaller errors than nominal feedforward at the highest speed.
 
     Args:
-        samples: samples of `measure_control`.
+        samples: samples of `measure_tracking_errors`.
         quantity: tracking error to compare on both paths: `error of actuator 5` or `Cartesian error`.
     """
     checks, notes = [], []
@@ -401,12 +401,12 @@ def evaluate_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluati
 
 def evaluate_drive_error(samples: Sequence[Sample]) -> Evaluation:
     """Check that identified feedforward reduces the RMS tracking error of actuator 5 against nominal feedforward."""
-    return evaluate_highest_speed(samples, "error of actuator 5")
+    return evaluate_errors_at_highest_speed(samples, "error of actuator 5")
 
 
 def evaluate_tool_error(samples: Sequence[Sample]) -> Evaluation:
     """Check that identified feedforward reduces the RMS position error of the tool against nominal feedforward."""
-    return evaluate_highest_speed(samples, "Cartesian error")
+    return evaluate_errors_at_highest_speed(samples, "Cartesian error")
 
 
 _CONTROL_QUOTE = (
@@ -420,7 +420,7 @@ _FORCE_SCALE_FAULT_TEXT = "the identification reads half of the actual forces"
 
 CONTROL = Experiment(
     "control",
-    measure_control,
+    measure_tracking_errors,
     (
         Claim("control errors on the circle", _CONTROL_QUOTE, "Fig. 10, section 5.4", "document",
               evaluate_circle_errors, _FORCE_SCALE_FAULT, _FORCE_SCALE_FAULT_TEXT,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
-from hydrotele.experiments.intervals import check_mean, check_statistic, collect_values
+from hydrotele.experiments.intervals import check_bootstrapped_statistic, check_mean, collect_values
 from hydrotele.experiments.palida import (
     PLOTTED_DRIVE,
     POSE_HIGH,
@@ -25,8 +25,8 @@ from hydrotele.experiments.palida import (
     simulate_measurement,
     simulate_motion,
 )
-from hydrotele.identify.estimation import estimate
-from hydrotele.identify.mechanism import convert_coordinates
+from hydrotele.identify.estimation import estimate_linear_parameters
+from hydrotele.identify.mechanism import convert_to_given_joints
 from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.record import IdentificationRecord
 
@@ -71,12 +71,12 @@ def average_periods(record: IdentificationRecord, period: float) -> AveragedPeri
     """
     rows = round(period / record.period)
     length, force = (part.reshape(-1, rows, 6).copy() for part in (record.position, record.force))
-    mean, covariance = average_force(force)
+    mean, covariance = average_force_over_periods(force)
     averaged = replace(record, position=length.mean(axis=0), force=mean)
-    return AveragedPeriod(process_lengths(averaged, period, "periodic"), mean, covariance)
+    return AveragedPeriod(compute_motion_from_lengths(averaged, period, "periodic"), mean, covariance)
 
 
-def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def average_force_over_periods(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Average repeated periods of the drive forces, and estimate the noise covariance of one reading.
 
     Args:
@@ -90,7 +90,9 @@ def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, rest.T @ rest / ((len(force) - 1) * len(mean))
 
 
-def process_lengths(record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS) -> np.ndarray:
+def compute_motion_from_lengths(
+    record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS
+) -> np.ndarray:
     """Compute poses, rates and accelerations of the platform from measured leg lengths.
 
     Args:
@@ -102,7 +104,7 @@ def process_lengths(record: IdentificationRecord, period: float, method: str, ha
     Returns:
         (3, n, 6) poses, rates and accelerations.
     """
-    pose = convert_coordinates(record, load_robot().setup)
+    pose = convert_to_given_joints(record, load_robot().setup)
     found = estimate_resolution(pose.position, pose.period, pose.position_noise)
     processing = (
         Processing("periodic", period=period, harmonics=harmonics) if method == "periodic"
@@ -130,7 +132,7 @@ def simulate_circle() -> RepeatedMotion:
     return simulate_motion(motion, rows / SAMPLE_RATE)
 
 
-def measure_processing(seed: int, changes: Changes) -> Sample:
+def compare_processing_methods(seed: int, changes: Changes) -> Sample:
     """Compare unfiltered, time-domain and frequency-domain processing of measured leg lengths.
 
     With each method the motion is reconstructed and a model is identified, which then predicts the
@@ -153,12 +155,12 @@ def measure_processing(seed: int, changes: Changes) -> Sample:
     true = cycle.motion[:, :, Y_AXIS]
     values, rebuilt, predicted = {}, {}, {}
     for way in METHOD_NAMES:
-        motion = process_lengths(record, cycle.period, way, settings["harmonics"])
+        motion = compute_motion_from_lengths(record, cycle.period, way, settings["harmonics"])
         rebuilt[way] = motion[:, :rows, Y_AXIS]
         for order, error in enumerate(rebuilt[way] - true):
             values[f"{way} {order}"] = float(np.std(error) / np.std(true[order]))
-        value = estimate(own.matrix(motion), record.force, compute_force_covariance(), order=0).value
-        circle = process_lengths(check, lap.period, way, settings["harmonics"])[:, middle]
+        value = estimate_linear_parameters(own.matrix(motion), record.force, compute_force_covariance(), order=0).value
+        circle = compute_motion_from_lengths(check, lap.period, way, settings["harmonics"])[:, middle]
         force = own.matrix(circle) @ value
         values[f"{way} variance"] = float(np.mean((force - check.force[middle]) ** 2))
         values[f"{way} true variance"] = float(np.mean((force - lap.force) ** 2))
@@ -232,7 +234,7 @@ def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
     identified from.
     """
     checks = tuple(
-        check_statistic(
+        check_bootstrapped_statistic(
             f"error variance, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
             collect_values(samples, f"{one} variance") / collect_values(samples, f"{other} variance"),
             lambda ratios: float(np.exp(np.mean(np.log(ratios)))), (0.0, 1.0),
@@ -250,7 +252,7 @@ def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
 
 PROCESSING = Experiment(
     "data processing",
-    measure_processing,
+    compare_processing_methods,
     (
         Claim(
             "reconstruction of the motion",

@@ -14,9 +14,9 @@ from scipy.optimize import brentq
 from scipy.stats import binomtest, ncx2
 
 from hydrotele.experiments.abdellatif_processing import (
-    average_force,
+    average_force_over_periods,
     average_periods,
-    process_lengths,
+    compute_motion_from_lengths,
 )
 from hydrotele.experiments.comparison import (
     Changes,
@@ -30,10 +30,10 @@ from hydrotele.experiments.comparison import (
 )
 from hydrotele.experiments.intervals import (
     CONFIDENCE,
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_statistic,
     collect_values,
 )
 from hydrotele.experiments.palida import (
@@ -43,12 +43,12 @@ from hydrotele.experiments.palida import (
     SYMBOLS,
     compute_control_gains,
     compute_force_covariance,
-    draw_force_noise,
     load_robot,
+    sample_force_noise,
     simulate_excitation,
     simulate_measurement,
 )
-from hydrotele.identify.estimation import estimate
+from hydrotele.identify.estimation import estimate_linear_parameters
 
 PERIODS_PER_TRIAL = 4
 """Repetitions of the motion in one trial; the document gives no number."""
@@ -163,7 +163,7 @@ TRIAL_SETTINGS = {
 
 - `friction_excess`: relative friction excess in the first trial.
 - `claimed_noise`: force noise standard deviation used in the estimate over the actual one.
-- `processing`: `periodic` or `raw`; see `process_lengths`.
+- `processing`: `periodic` or `raw`; see `compute_motion_from_lengths`.
 - `trials`: number of trials.
 """
 
@@ -188,14 +188,14 @@ def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
     record = simulate_measurement(cycle, PERIODS_PER_TRIAL, rng)
     lengths = record.position.reshape(PERIODS_PER_TRIAL, -1, 6).mean(axis=0)
     averaged = replace(record, position=lengths, force=cycle.force)
-    motion = process_lengths(averaged, cycle.period, settings["processing"])
+    motion = compute_motion_from_lengths(averaged, cycle.period, settings["processing"])
     equations = NormalEquations(own.matrix(motion))
     friction = cycle.matrix[:, :, _IS_FRICTION] @ own.truth[_IS_FRICTION]
     friction = settings["friction_excess"] * friction
     found, weights = [], []
     for number in range(settings["trials"]):
-        noise = draw_force_noise((PERIODS_PER_TRIAL, len(lengths)), rng)
-        mean, covariance = average_force(noise)
+        noise = sample_force_noise((PERIODS_PER_TRIAL, len(lengths)), rng)
+        mean, covariance = average_force_over_periods(noise)
         covariance = settings["claimed_noise"] ** 2 * covariance / PERIODS_PER_TRIAL
         weights.append(np.linalg.inv(covariance))
         found.append(equations.correlate(cycle.force + EXCESS_DECAY**number * friction + mean))
@@ -212,7 +212,7 @@ def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
     return TrialEstimates(value, information, warm[0], plain, rippled, claimed[0])
 
 
-def measure_trials(seed: int, changes: Changes) -> Sample:
+def compute_trial_statistics(seed: int, changes: Changes) -> Sample:
     """Simulate one series of identification trials and compute statistics of its estimates.
 
     Args:
@@ -228,7 +228,7 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
     later = trials.value[1:]
     mean = later.mean(axis=0)
     std = np.sqrt(np.diag(np.linalg.inv(trials.information[-1])))
-    distance = compute_square_distance(trials.value - mean, trials.information)
+    distance = compute_squared_mahalanobis(trials.value - mean, trials.information)
     rippled = trials.ripple_estimates[1:] - trials.ripple_estimates[1:].mean(axis=0)
     outside = np.abs(trials.value - mean) > 2.0 * std
     values = {
@@ -236,10 +236,10 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
         "inside": float(1.0 - outside[1:].mean()), "first": float(outside[0].mean()),
         "p1": float(outside[1:, 0].mean()), "first distance": float(distance[0]),
         "warm first distance": float(
-            compute_square_distance(trials.first_without_excess - mean, trials.information[0])),
+            compute_squared_mahalanobis(trials.first_without_excess - mean, trials.information[0])),
         "rippled": float(np.mean(
-            compute_square_distance(rippled, trials.ripple_information) < CHI2_LIMIT)),
-        "common shift": float(np.sqrt(compute_square_distance(
+            compute_squared_mahalanobis(rippled, trials.ripple_information) < CHI2_LIMIT)),
+        "common shift": float(np.sqrt(compute_squared_mahalanobis(
             mean - load_robot().truth, trials.information[-1]))),
     }  # fmt: skip
     arrays = {"value": trials.value, "least_squares": trials.least_squares, "std": std,
@@ -248,7 +248,7 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
                   arrays)  # fmt: skip
 
 
-def compute_square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
+def compute_squared_mahalanobis(error: np.ndarray, information: np.ndarray) -> np.ndarray:
     """Return the squared Mahalanobis distance of parameter errors, Abdellatif 2008, (29).
 
     Args:
@@ -298,14 +298,14 @@ def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
     reason = "noise and geometry of the model are chosen to agree within a factor of two"
     return Evaluation(
         (
-            check_exact(f"{words}smallest ({SYMBOLS[low]})", ratio[low], (0.5, 2.0), reason),
-            check_exact(f"{words}largest ({SYMBOLS[high]})", ratio[high], (0.5, 2.0), reason),
+            check_deterministic_value(f"{words}smallest ({SYMBOLS[low]})", ratio[low], (0.5, 2.0), reason),
+            check_deterministic_value(f"{words}largest ({SYMBOLS[high]})", ratio[high], (0.5, 2.0), reason),
         ),
         note=f"geometric mean {np.exp(np.mean(np.log(ratio))):.2f}",
     )
 
 
-def evaluate_history(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_estimates_over_trials(samples: Sequence[Sample]) -> Evaluation:
     """Check which estimates lie inside their own 95 % intervals about the mean of the series of trials.
 
     At most 10 % of the estimates of later trials may lie outside. More than 10 % of those of the first
@@ -402,7 +402,7 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
     degrees = len(mean)
     squared = count * float(mean @ np.linalg.solve(covariance, mean))
 
-    def bound(chance: float) -> float:
+    def find_bias_bound(chance: float) -> float:
         if ncx2.cdf(squared, degrees, 0.0) < chance:
             return 0.0
         high = 4.0 * squared + 100.0
@@ -411,12 +411,12 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
 
     return Check(
         quantity, float(np.sqrt(max(squared - degrees, 0.0) / count)),
-        bound(0.5 + CONFIDENCE / 2.0), bound(0.5 - CONFIDENCE / 2.0), (1.0, np.inf),
+        find_bias_bound(0.5 + CONFIDENCE / 2.0), find_bias_bound(0.5 - CONFIDENCE / 2.0), (1.0, np.inf),
         "detectable in one experiment: at least one standard deviation of its estimate",
     )  # fmt: skip
 
 
-def evaluate_least_squares(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_least_squares_bias(samples: Sequence[Sample]) -> Evaluation:
     """Check whether unweighted least squares is biased if the force noise of the drives is cross-correlated."""
     truth = load_robot().truth
     value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
@@ -443,7 +443,7 @@ METHODS = {
 }
 
 
-def measure_encoder_feedback(seed: int, changes: Changes) -> Sample:
+def measure_bias_by_encoder_feedback(seed: int, changes: Changes) -> Sample:
     """Measure the parameter errors of three methods when controllers feed encoder noise into the forces.
 
     Args:
@@ -459,25 +459,25 @@ def measure_encoder_feedback(seed: int, changes: Changes) -> Sample:
         cycle, periods, np.random.default_rng([21, seed]), compute_control_gains(),
         settings["length_noise"] * LENGTH_NOISE,
     )  # fmt: skip
-    sampled = NormalEquations(own.matrix(process_lengths(record, cycle.period, "raw")))
+    sampled = NormalEquations(own.matrix(compute_motion_from_lengths(record, cycle.period, "raw")))
     mean = average_periods(record, cycle.period)
     weight = np.linalg.inv(mean.covariance)[None]
     found = sampled.correlate(record.force)[None]
     value = {
         "samples, least squares": sampled.solve(np.eye(6)[None], found)[0][0],
         "samples, Gauss-Markov": sampled.solve(weight, found)[0][0],
-        "periods, Gauss-Markov": estimate(
+        "periods, Gauss-Markov": estimate_linear_parameters(
             own.matrix(mean.motion), mean.force, mean.covariance, order=0).value,
     }  # fmt: skip
     return Sample({}, arrays={name: (one - own.truth) / _PRINTED_DEVIATIONS for name, one in value.items()})
 
 
-def evaluate_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_bias_by_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
     """Check that encoder noise in regressor and forces biases estimates from samples, but not from mean periods."""
     checks = []
     for name, words in METHODS.items():
         biased = name.startswith("samples")
-        checks.append(check_statistic(
+        checks.append(check_bootstrapped_statistic(
             f"bias of {words}, RMS of 24 parameters",
             np.array([sample.arrays[name] for sample in samples]),
             lambda errors: float(np.sqrt(np.mean(errors.mean(axis=0) ** 2))),
@@ -493,7 +493,7 @@ _COVARIANCE_FAULT_TEXT = "the covariance assumes half of the actual noise"
 
 TRIAL_SERIES = Experiment(
     "trials",
-    measure_trials,
+    compute_trial_statistics,
     (
         Claim(
             "estimates within the printed intervals",
@@ -511,7 +511,8 @@ TRIAL_SERIES = Experiment(
             ' observed though, such the very small first rigid-body parameter and the first few'
             ' measurement trials." "due to the variation of friction at the beginning of the'
             ' measurement process until a nearly stationary state is reached."',
-            "Fig. 8, section 5.3", "document", evaluate_history, _COVARIANCE_FAULT, _COVARIANCE_FAULT_TEXT,
+            "Fig. 8, section 5.3", "document", evaluate_estimates_over_trials, _COVARIANCE_FAULT,
+            _COVARIANCE_FAULT_TEXT,
             tuple(f"{SYMBOLS[k]} over its mean [1]" for k in (0, 1, 4, 9, 12, 18)),
         ),
         Claim(
@@ -538,7 +539,7 @@ TRIAL_SERIES = Experiment(
         Claim(
             "bias of least squares",
             '"Neglecting this fact by applying the simple LS-method will lead to biased estimates"',
-            "section 3, after (21)", "document", evaluate_least_squares,
+            "section 3, after (21)", "document", evaluate_least_squares_bias,
             {"friction_excess": 0.0}, "friction is stationary from the start", (),
         ),
     ),
@@ -546,13 +547,13 @@ TRIAL_SERIES = Experiment(
 
 ENCODER_FEEDBACK = Experiment(
     "controllers that react to encoder noise",
-    measure_encoder_feedback,
+    measure_bias_by_encoder_feedback,
     (
         Claim(
             "bias by controllers",
             "controllers feed encoder noise back into the forces; least squares and"
             " Gauss-Markov on samples are then biased, the frequency-domain processing is not",
-            "section 3, after (21)", "additional", evaluate_encoder_feedback,
+            "section 3, after (21)", "additional", evaluate_bias_by_encoder_feedback,
             {"length_noise": 0.001}, "encoders without noise", (),
         ),
     ),

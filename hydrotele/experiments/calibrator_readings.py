@@ -16,7 +16,7 @@ import numpy as np
 from hydrotele.calibrate.arm import calibrated_machine, identify_arm, identify_jointly
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, Sweep, SweepPoses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position, build_loop, frame_after_links
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position_from_axis, build_loop, frame_after_links
 from hydrotele.control.resolved_motion import pose_to_joints
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Pose
@@ -55,7 +55,7 @@ def simulate_readings(
     )  # fmt: skip
 
 
-def draw_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: float = 1.0) -> dict[str, Sweep]:
+def sample_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: float = 1.0) -> dict[str, Sweep]:
     """Draw a random back-and-forth motion of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
 
     The scanned figures do not show the motion over time. The number of cycles is therefore uniform in
@@ -78,7 +78,7 @@ def draw_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: flo
     }  # fmt: skip
 
 
-def draw_gravity_bends(
+def sample_gravity_bends(
     loop: CalibrationLoop, clean: SweepPoses, rng: np.random.Generator, deviation_deg: float = 1.0,
     bent_fraction: float = 0.35,
     constant: bool = False,
@@ -199,7 +199,7 @@ def find_true_parameters(
         if kind == "held":
             found.append(float(stages[loop.links[place - 1]].theta[:, place].mean()))
         elif kind in ("p_xy", "p_z"):
-            seen = ball_position(loop, place, stages[link].theta[:1, place + 1 :])[0]
+            seen = ball_position_from_axis(loop, place, stages[link].theta[:1, place + 1 :])[0]
             height = seen[2] - loop.values[place, 3] + nominal.values[place, 3]
             found.append(float(np.hypot(*seen[:2]) if kind == "p_xy" else height))
         else:
@@ -238,12 +238,12 @@ def compute_tip_errors(
     data = mujoco.MjData(model)
     sums = []
     for machine in (nominal, made):
-        squares = [_compute_square_error(machine, known, loop, model, data, target) for target in TIP_TARGETS]
+        squares = [_compute_squared_tip_error(machine, known, loop, model, data, target) for target in TIP_TARGETS]
         sums.append(float(np.sqrt(np.mean(squares))))
     return sums[0], sums[1]
 
 
-def _compute_square_error(
+def _compute_squared_tip_error(
     machine: Machine, known: CalibrationLoop, loop: CalibrationLoop, model, data, target
 ) -> float:
     """Return the squared distance of the true tip from a target that a machine model commands [m^2]."""

@@ -359,10 +359,10 @@ def run_series(
     Returns:
         The rows, in the order of the document.
     """
-    return compare_by_seeds(series, (seeds,), jobs, progress)[seeds]
+    return compare_by_repetition_count(series, (seeds,), jobs, progress)[seeds]
 
 
-def compare_by_seeds(
+def compare_by_repetition_count(
     series: Series, counts: Sequence[int], jobs: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, list[Comparison]]:  # fmt: skip

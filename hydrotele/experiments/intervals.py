@@ -26,7 +26,9 @@ def collect_values(samples: Sequence[Sample], name: str) -> np.ndarray:
     return np.array([sample.values[name] for sample in samples])
 
 
-def check_exact(quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any) -> Check:
+def check_deterministic_value(
+    quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any
+) -> Check:
     """Return a check of a quantity without random error: its confidence interval is its value."""
     return Check(quantity, float(value), float(value), float(value), accepted, reason, **more)
 
@@ -75,7 +77,7 @@ def check_fraction(
                  reason, **more)  # fmt: skip
 
 
-def check_statistic(
+def check_bootstrapped_statistic(
     quantity: str, values: np.ndarray, statistic: Callable[[np.ndarray], float],
     accepted: tuple[float, float], reason: str, **more: Any,
 ) -> Check:  # fmt: skip
@@ -103,7 +105,9 @@ def check_statistic(
     return Check(quantity, value, float(low), float(high), accepted, reason, **more)
 
 
-def check_population(quantity: str, values: np.ndarray, published: float, unit: str = "", log: bool = True) -> Check:
+def check_published_in_population(
+    quantity: str, values: np.ndarray, published: float, unit: str = "", log: bool = True
+) -> Check:
     """Return a check whether a published value lies in the central 95 % of the repetitions.
 
     The checked quantity is the distance d of the published value from the mean of the repetitions,

@@ -17,9 +17,9 @@ from hydrotele.calibrate.design import generate_sweep_poses
 from hydrotele.calibrate.loop import CalibrationLoop, build_loop, unit_of
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
-    draw_gravity_bends,
-    draw_sweeps,
     find_true_parameters,
+    sample_gravity_bends,
+    sample_sweeps,
     simulate_readings,
 )
 from hydrotele.experiments.comparison import (
@@ -33,11 +33,11 @@ from hydrotele.experiments.comparison import (
 )
 from hydrotele.experiments.intervals import (
     MAJORITY_RANGE,
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_population,
-    check_statistic,
+    check_published_in_population,
     collect_values,
 )
 from hydrotele.machine.machine_file import load_machine
@@ -126,7 +126,7 @@ SETTINGS = {
     "bent_share": 0.35,
     "poses": 1.0,
 }
-"""Settings of `measure_simulations`.
+"""Settings of `measure_disturbance_effects`.
 
 - `drift`: whether held links drift.
 - `accuracy`: largest sensor error [rad].
@@ -156,13 +156,13 @@ def identify_with_disturbance(
         `error.NAME` of the parameters [m] or [rad] and `iterations.LINK`. The error of a held
         link's angle is relative to its mean.
     """
-    sweeps = draw_sweeps(np.random.default_rng([19, seed]), disturbance.drift, pose_fraction)
+    sweeps = sample_sweeps(np.random.default_rng([19, seed]), disturbance.drift, pose_fraction)
     clean = [generate_sweep_poses(loop, link, sweeps[link], seed) for link in SIMULATED_STAGES]
     rng = np.random.default_rng([92, seed])
     stages = [
         simulate_readings(
             loop, one, rng if disturbance.accuracy else None, disturbance.accuracy or MAX_RESOLVER_ERROR,
-            draw_gravity_bends(loop, one, rng, disturbance.bend, bent_fraction, disturbance.constant_bends)
+            sample_gravity_bends(loop, one, rng, disturbance.bend, bent_fraction, disturbance.constant_bends)
             if disturbance.bend else None,
         )
         for one in clean
@@ -175,7 +175,7 @@ def identify_with_disturbance(
     return found | {f"iterations.{stage.link}": float(stage.iterations) for stage in fit.stages}
 
 
-def measure_simulations(seed: int, changes: Changes) -> Sample:
+def measure_disturbance_effects(seed: int, changes: Changes) -> Sample:
     """Identify the arm from the same trajectories under five combinations of drift, sensor errors and bends.
 
     Args:
@@ -213,14 +213,14 @@ def measure_simulations(seed: int, changes: Changes) -> Sample:
 
 
 INITIAL_ESTIMATE_SETTINGS = {"length": 0.2, "angle": 10.0, "starts": 4, "poses": 1.0}
-"""Settings of `measure_initial_estimates`.
+"""Settings of `compare_initial_estimates`.
 
 `length` [m] and `angle` [deg] are the largest distances of an initial estimate from nominal,
 `starts` is the number of initial estimates, and `poses` is the fraction of the poses.
 """
 
 
-def measure_initial_estimates(seed: int, changes: Changes) -> Sample:
+def compare_initial_estimates(seed: int, changes: Changes) -> Sample:
     """Identify the arm from the same readings with several random initial estimates.
 
     Args:
@@ -233,7 +233,7 @@ def measure_initial_estimates(seed: int, changes: Changes) -> Sample:
     chosen = merge_settings(INITIAL_ESTIMATE_SETTINGS, changes)
     loop = build_loop(load_machine("calibrator"))
     rng = np.random.default_rng([7, seed])
-    sweeps = draw_sweeps(rng, pose_fraction=chosen["poses"])
+    sweeps = sample_sweeps(rng, pose_fraction=chosen["poses"])
     stages = [simulate_readings(loop, generate_sweep_poses(loop, link, sweeps[link], seed), rng)
               for link in SIMULATED_STAGES]  # fmt: skip
     first = identify_arm(loop, stages, weighted=False, parameters_by_link=STAGE_PARAMETERS)
@@ -262,24 +262,24 @@ def measure_exact_readings(seed: int, changes: Changes) -> Sample:
     return Sample({"worst": float(np.abs(errors).max())})
 
 
-def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
+def check_published_length_errors(samples: Sequence[Sample], case: str) -> list[Check]:
     """Return one check per link length: whether its published error is typical of the simulated errors.
 
     A published error agrees if it lies in the central 95 % of the repetitions.
 
     Args:
-        samples: samples of `measure_simulations`.
+        samples: samples of `measure_disturbance_effects`.
         case: `drift` or `sensor`.
     """
     return [
-        check_population(
+        check_published_in_population(
             f"error of {LENGTH_SYMBOLS[name]}", 1e3 * collect_values(samples, f"{case}.error.{name}"),
             1e3 * find_published_error(case, name), "mm", log=False,
         ) for name in LENGTH_PARAMETERS
     ]  # fmt: skip
 
 
-def check_largest_error(samples: Sequence[Sample], case: str) -> Check:
+def check_d0_error_is_largest(samples: Sequence[Sample], case: str) -> Check:
     """Return a check whether length d0 has the largest error of all lengths in most simulated trajectories."""
     leads = [abs(s.values[f"{case}.error.p_z.swing"]) >= s.values[f"{case}.largest"]
              for s in samples]  # fmt: skip
@@ -312,10 +312,10 @@ def check_rms_ratio(
     """
     rows = np.column_stack([collect_values(samples, name) for name in names])
 
-    def ratio(values: np.ndarray) -> float:
+    def compute_rms_ratio(values: np.ndarray) -> float:
         return compute_rms(values[:, 0]) / compute_rms(values[:, 1])
 
-    return check_statistic(quantity, rows, ratio, accepted, reason, published=published)
+    return check_bootstrapped_statistic(quantity, rows, compute_rms_ratio, accepted, reason, published=published)
 
 
 A3_ERROR_REASON = (
@@ -330,12 +330,12 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
     Length d0 must have the largest error, and each published error must be typical of the repetitions.
     """
     # alpha 1 is the only twist that drift changes; it is printed as -90.0 deg.
-    twist = check_population(
+    twist = check_published_in_population(
         "error of alpha 1", np.degrees(collect_values(samples, "drift.error.alpha.swing")), 0.0, "deg",
         log=False,
     )  # fmt: skip
     return Evaluation(
-        (check_largest_error(samples, "drift"), *check_lengths(samples, "drift"), twist),
+        (check_d0_error_is_largest(samples, "drift"), *check_published_length_errors(samples, "drift"), twist),
         A3_ERROR_REASON,
         note=describe_lengths(samples, "drift"),
     )
@@ -346,7 +346,7 @@ def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
 
     The twist errors (alpha and beta) must also be proportional to the sensor errors.
     """
-    twists = check_population(
+    twists = check_published_in_population(
         "RMS error of alpha and beta", np.degrees(collect_values(samples, "sensor.twists")),
         compute_rms(PUBLISHED_TWISTS["sensor"]), "deg",
     )  # fmt: skip
@@ -356,8 +356,8 @@ def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
     return Evaluation(
         (
-            check_largest_error(samples, "sensor"),
-            *check_lengths(samples, "sensor"),
+            check_d0_error_is_largest(samples, "sensor"),
+            *check_published_length_errors(samples, "sensor"),
             twists,
             proportion,
         ),
@@ -382,9 +382,9 @@ def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
             ("flexible.largest", "sensor.largest"), (0.5 * ratio, 2.0 * ratio),
             "a factor of 2 around a single sample of errors", ratio,
         ),
-        check_population("RMS error of the lengths", 1e3 * collect_values(samples, "flexible.lengths"),
+        check_published_in_population("RMS error of the lengths", 1e3 * collect_values(samples, "flexible.lengths"),
                          1e3 * lengths, "mm"),
-        check_population("RMS error of alpha and beta",
+        check_published_in_population("RMS error of alpha and beta",
                          np.degrees(collect_values(samples, "flexible.twists")),
                          compute_rms(PUBLISHED_TWISTS["flexible"]), "deg"),
         check_rms_ratio(
@@ -436,17 +436,17 @@ def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
     half = 100.0 * collect_values(samples, "half.error.a.swing") / size
     both = 100.0 * np.abs(collect_values(samples, "sensor.error.a.swing")) / size
     return Evaluation((
-        check_statistic(
+        check_bootstrapped_statistic(
             "95 % limit (1.96 RMS) with 0.05 deg and no drift", half,
             lambda values: 1.96 * compute_rms(values), (1.25, 5.0),
             "a factor of 2 around the maximum of an unknown number of runs", unit="%",
             published=2.5,
         ),
-        check_population("error with drift and 0.1 deg", both, 10.0, "%"),
+        check_published_in_population("error with drift and 0.1 deg", both, 10.0, "%"),
     ))  # fmt: skip
 
 
-def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_sensor_fraction_of_error(samples: Sequence[Sample]) -> Evaluation:
     """Check whether sensor errors cause half of the error of the swing's length a1.
 
     Khoshzaban 1992, p. 60, says so for sensors within 0.1 deg with drift.
@@ -454,13 +454,13 @@ def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
     rows = np.column_stack([collect_values(samples, f"{case}.error.a.swing")
                             for case in ("half", "sensor", "drift")])  # fmt: skip
 
-    def share(values: np.ndarray) -> float:
+    def compute_sensor_fraction(values: np.ndarray) -> float:
         return 2.0 * compute_rms(values[:, 0]) / compute_rms(values[:, 1])
 
     alone = compute_rms(rows[:, 2]) / compute_rms(rows[:, 1])
     return Evaluation(
-        (check_statistic("error of a1 by sensors of 0.1 deg over that with drift", rows, share,
-                         (0.35, 0.65), "half, to one digit", published=0.5),),
+        (check_bootstrapped_statistic("error of a1 by sensors of 0.1 deg over that with drift", rows,
+                         compute_sensor_fraction, (0.35, 0.65), "half, to one digit", published=0.5),),
         f"drift alone causes {alone:.2f} times the error of both, so that the sensors contribute"
         " little; by Tables 4 and 5, drift causes 34 of 42 mm",
     )  # fmt: skip
@@ -514,7 +514,7 @@ def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
     Khoshzaban 1992 says so on pp. 62 and 121.
     """
     return Evaluation((
-        check_exact("largest difference of the results", float(collect_values(samples, "spread").max()),
+        check_deterministic_value("largest difference of the results", float(collect_values(samples, "spread").max()),
                     (0.0, 5e-4), "half of the last printed digit of a length", unit="m or rad"),
     ))  # fmt: skip
 
@@ -522,7 +522,7 @@ def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
     """Check that the calibration identifies the true parameters from readings without errors."""
     return Evaluation((
-        check_exact("largest error of a parameter", float(collect_values(samples, "worst").max()),
+        check_deterministic_value("largest error of a parameter", float(collect_values(samples, "worst").max()),
                     (0.0, 1e-9), "rounding only", unit="m or rad"),
     ))  # fmt: skip
 
@@ -534,7 +534,7 @@ EXPERIMENTS = (
             "additional", evaluate_exact_readings, {"accuracy": 1e-6}, "sensor errors are within 1 urad",
         ),
     ), fixed_repetitions=1),
-    Experiment("simulated calibrations", measure_simulations, (
+    Experiment("simulated calibrations", measure_disturbance_effects, (
         Claim(
             "drift alone",
             "The maximum error belongs to d0 (0.068 m); the drift does not contribute any"
@@ -574,7 +574,8 @@ EXPERIMENTS = (
         Claim(
             "share of the sensors in the error of a1",
             '"about half of the error obtained here is due to the sensor accuracy"',
-            "section 3.7.2, p. 60", "document", evaluate_sensor_fraction, {"accuracy": 0.1 * MAX_RESOLVER_ERROR},
+            "section 3.7.2, p. 60", "document", evaluate_sensor_fraction_of_error,
+            {"accuracy": 0.1 * MAX_RESOLVER_ERROR},
             "sensor errors are a tenth as large",
         ),
         Claim(
@@ -592,7 +593,7 @@ EXPERIMENTS = (
             "sensor errors are within 5 deg",
         ),
     )),
-    Experiment("first estimates", measure_initial_estimates, (
+    Experiment("first estimates", compare_initial_estimates, (
         Claim(
             "first estimates",
             '"A number of different initial conditions were tried, but the iterations always ended'

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hydrotele.calibrate.arm import ArmFit, identify_arm, initial_parameters
-from hydrotele.calibrate.arm_poses import Poses, add_drift
-from hydrotele.calibrate.bad_data import identify_without_bad_data, predict_readings
+from hydrotele.calibrate.arm_poses import Poses, add_held_link_drift
+from hydrotele.calibrate.bad_data import identify_without_bad_data, predict_reading_from_others
 from hydrotele.calibrate.design import SweepPoses, generate_sweep_poses
 from hydrotele.calibrate.linkage import (
     PARAMETER_NAMES,
     AxisStrokes,
-    identify_joint_angles,
+    compute_angles_from_calibrator,
     identify_linkage,
     linkage_parameters,
 )
@@ -35,9 +35,9 @@ from hydrotele.calibrate.loop import (
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
     compute_retraction_bends,
-    draw_sweeps,
     find_true_parameters,
     perturb_loop,
+    sample_sweeps,
     simulate_readings,
 )
 from hydrotele.experiments.comparison import Changes, Panel, Sample, merge_settings
@@ -59,7 +59,7 @@ SETTINGS = {
     "bent": ("grapple", "calibrator_yoke"), "removal": True, "tape": 0.005, "transducer": 0.002,
     "built": 0.0, "poses": 1.0,
 }  # fmt: skip
-"""Settings of `measure_calibration` and `measure_bend_detection`.
+"""Settings of `measure_calibration_errors` and `measure_bend_detection`.
 
 - `drift`: whether held links drift.
 - `accuracy`: largest error of the angle sensors [rad].
@@ -138,7 +138,7 @@ def simulate_stages(seed: int, settings: Mapping[str, Any], rng: np.random.Gener
     loop = build_loop(load_machine("calibrator"))
     built = settings["built"]
     true = perturb_loop(loop, rng, built, built / 0.03) if built else loop
-    sweeps = draw_sweeps(rng, settings["drift"], settings["poses"])
+    sweeps = sample_sweeps(rng, settings["drift"], settings["poses"])
     clean = [generate_sweep_poses(true, link, sweeps[link], seed) for link in IDENTIFIABLE_PARAMETERS]
     low, high = np.radians(settings["bend"])
     sizes = {joint: rng.uniform(low, high) * rng.choice([-1.0, 1.0]) for joint in settings["bent"]}
@@ -146,13 +146,13 @@ def simulate_stages(seed: int, settings: Mapping[str, Any], rng: np.random.Gener
     for one in clean:
         extra, bent = compute_retraction_bends(true, one, sizes)
         readings = simulate_readings(true, one, rng, settings["accuracy"], extra)
-        stages.append(add_drift(loop, readings))
+        stages.append(add_held_link_drift(loop, readings))
         inside = bent if one.link == "stick" else inside
     kept = [exclude_bent_poses(loop, one) for one in stages] if settings["removal"] else stages
     return Calibration(loop, true, clean, inside, stages, kept)
 
 
-def identify_both_models(calibration: Calibration) -> dict[str, ArmFit]:
+def identify_with_and_without_bends(calibration: Calibration) -> dict[str, ArmFit]:
     """Identify the arm from all poses (`identified`) and without the bent poses (`reidentified`)."""
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     return {
@@ -180,7 +180,7 @@ def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
     return stage.select(gap < MIN_VISIBLE_DIFFERENCE * np.linalg.norm(loop.ball - place, axis=1))
 
 
-def measure_calibration(seed: int, changes: Changes) -> Sample:
+def measure_calibration_errors(seed: int, changes: Changes) -> Sample:
     """Calibrate a machine with and without the poses of bent joints, and compute the errors of both results.
 
     Args:
@@ -193,13 +193,13 @@ def measure_calibration(seed: int, changes: Changes) -> Sample:
     chosen = merge_settings(SETTINGS, changes)
     rng = np.random.default_rng([38, seed])
     done = simulate_stages(seed, chosen, rng)
-    done = done._replace(fits=identify_both_models(done))
+    done = done._replace(fits=identify_with_and_without_bends(done))
     values, panels = {}, []
     for name, fit in done.fits.items():
         values |= _compute_parameter_errors(done, name, fit)
-    for part in (_compare_sensors(done), _compare_end_points(done),
+    for part in (_compare_calibrator_readings(done), _compare_end_points(done),
                  _compare_distances(done, chosen["tape"], rng),
-                 _identify_minor_links(done, chosen, rng)):  # fmt: skip
+                 _identify_cylinder_triangles(done, chosen, rng)):  # fmt: skip
         values |= part.values
         panels += part.panels
     return Sample(values, tuple(panels))
@@ -254,7 +254,7 @@ def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit)
     return found
 
 
-def _compare_sensors(calibration: Calibration) -> Sample:
+def _compare_calibrator_readings(calibration: Calibration) -> Sample:
     """Compare each calibrator reading of the stick's stage with that predicted from the other sensors.
 
     The prediction uses the nominal model. The RMS differences [deg] are computed for poses inside and
@@ -262,7 +262,7 @@ def _compare_sensors(calibration: Calibration) -> Sample:
     """
     loop, inside = calibration.loop, calibration.bent_poses
     stage = next(one for one in calibration.stages if one.link == "stick")
-    predicted = predict_readings(loop, stage, _find_nominal_parameters(loop, stage))
+    predicted = predict_reading_from_others(loop, stage, _compute_nominal_stage_parameters(loop, stage))
     difference = np.degrees(stage.theta - predicted)
     pose = np.arange(len(stage), dtype=float)
     values, panels = (
@@ -289,7 +289,7 @@ def _compare_sensors(calibration: Calibration) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _find_nominal_parameters(loop: CalibrationLoop, stage: Poses) -> dict[str, float]:
+def _compute_nominal_stage_parameters(loop: CalibrationLoop, stage: Poses) -> dict[str, float]:
     """Return the parameters of one stage that follow from the nominal chain and the manipulator's sensors."""
     theta = loop.home[None].copy()
     place = loop.links.index(stage.link)
@@ -302,7 +302,7 @@ def _find_nominal_parameters(loop: CalibrationLoop, stage: Poses) -> dict[str, f
                       f"p_z.{stage.link}": float(ball[2])}  # fmt: skip
 
 
-def _find_model(calibration: Calibration, name: str) -> ArmModel:
+def _select_arm_model(calibration: Calibration, name: str) -> ArmModel:
     if name == "nominal":
         return ArmModel(calibration.loop.values, calibration.loop.ball, float(calibration.loop.home[3]))
     fit = calibration.fits[name]
@@ -344,10 +344,10 @@ def compute_end_position(model: ArmModel, theta: np.ndarray, side: str, links: i
 
 def _compare_end_points(calibration: Calibration) -> Sample:
     """Compute RMS differences of end-point positions between both identified models and the nominal one [m]."""
-    nominal, values, panels = _find_model(calibration, "nominal"), {}, []
+    nominal, values, panels = _select_arm_model(calibration, "nominal"), {}, []
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     for name, stages in used.items():
-        model = _find_model(calibration, name)
+        model = _select_arm_model(calibration, name)
         stages = [stage for stage in stages if stage.link in SIMULATED_STAGES]
         for end, links in END_POINT_LINKS.items():
             for side in SIDES:
@@ -383,7 +383,7 @@ def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Gen
         taped = np.linalg.norm(compute_end_position(actual, truth[chosen], "manipulator", links), axis=1)
         taped = taped + tape * rng.standard_normal(_TAPED_DISTANCES)
         for name in ("nominal", "identified", "reidentified"):
-            model = _find_model(calibration, name)
+            model = _select_arm_model(calibration, name)
             theta = np.concatenate([_compute_joint_angles(calibration.loop, model, stage) for _, stage in pairs])[
                 chosen
             ]
@@ -405,7 +405,9 @@ def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Gen
     return Sample(values, (panel,))
 
 
-def _identify_minor_links(calibration: Calibration, settings: Mapping[str, Any], rng: np.random.Generator) -> Sample:
+def _identify_cylinder_triangles(
+    calibration: Calibration, settings: Mapping[str, Any], rng: np.random.Generator
+) -> Sample:
     """Identify the triangles of the boom and stick cylinders from measured and from computed joint angles.
 
     Computed angles follow from the calibrator's readings and the re-identified arm.
@@ -422,7 +424,7 @@ def _identify_minor_links(calibration: Calibration, settings: Mapping[str, Any],
         length = _compute_true_displacement(machine, axis, angle)
         length = length + rng.uniform(-transducer, transducer, len(length))
         measured = stage.manipulator[axis] * calibration.loop.signs[place]
-        computed = identify_joint_angles(calibration.fits["reidentified"], stage)
+        computed = compute_angles_from_calibrator(calibration.fits["reidentified"], stage)
         residuals = {}
         for kind, strokes in (
             ("measured", AxisStrokes(axis, measured, length, *sigma)),

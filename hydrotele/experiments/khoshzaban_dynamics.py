@@ -21,9 +21,9 @@ from hydrotele.experiments.comparison import (
     merge_settings,
 )
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
@@ -32,11 +32,11 @@ from hydrotele.experiments.khoshzaban_models import (
     SAMPLE_PERIOD,
     UNITS,
     Motion,
-    draw_motion,
-    draw_states,
-    make_document_setup,
     make_regressor,
-    scale_cylinders,
+    make_thesis_regressor_setup,
+    sample_motion,
+    sample_states,
+    scale_cylinder_inertia,
     stack_rows,
 )
 from hydrotele.experiments.khoshzaban_prediction import PREDICTION
@@ -60,7 +60,7 @@ FORCE_SETTINGS = {
 _MIN_FORCE_FRACTION = 0.5  # fraction of the peak force above which the factor between two forces is meaningful
 
 
-def measure_forces(seed: int, changes: Changes) -> Sample:
+def compare_model_forces(seed: int, changes: Changes) -> Sample:
     """Compare drive forces along a random motion with and without the inertia of the cylinders.
 
     Args:
@@ -71,14 +71,14 @@ def measure_forces(seed: int, changes: Changes) -> Sample:
         Factors between the forces of the complete and the reduced model, and their RMS differences.
     """
     settings = merge_settings(FORCE_SETTINGS, changes)
-    motion = draw_motion(np.random.default_rng(seed))
-    table = make_regressor(make_document_setup("complete"), motion)
-    parameters = scale_cylinders(table, settings["cylinder_scale"])
+    motion = sample_motion(np.random.default_rng(seed))
+    table = make_regressor(make_thesis_regressor_setup("complete"), motion)
+    parameters = scale_cylinder_inertia(table, settings["cylinder_scale"])
     if settings["rods_beyond_pins"]:
         turned = [name.startswith("moment_x") and name.endswith("_rod") for name in table.names]
         parameters = np.where(turned, -parameters, parameters)
     complete = table.matrix @ parameters
-    reduced = table.matrix @ scale_cylinders(table, 0.0)
+    reduced = table.matrix @ scale_cylinder_inertia(table, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = np.maximum(np.abs(complete / reduced), np.abs(reduced / complete))
     share = np.abs(complete) / np.abs(complete).max(axis=0)
@@ -120,7 +120,7 @@ def _draw_forces(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> t
     return tuple(panels)
 
 
-def evaluate_force_factor(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_factor_between_forces(samples: Sequence[Sample]) -> Evaluation:
     """Check whether neglecting the cylinders' inertia changes a drive's force by a factor of two or more.
 
     Only instants with more than half of the peak force count.
@@ -160,7 +160,7 @@ def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
             "RMS difference of both models' forces, boom", rows[:, 0],
             (SENSOR_ACCURACY[1], np.inf), "large: above the sensors' accuracy (p. 108)", unit="N",
         ),
-        check_statistic(
+        check_bootstrapped_statistic(
             "the same, boom over stick", rows,
             lambda r: float(np.linalg.norm(r[:, 0]) / max(np.linalg.norm(r[:, 1]), 1e-300)),
             (1.0, np.inf), "the proximal cylinder's error is larger",
@@ -187,7 +187,7 @@ def describe_motions(samples: Sequence[Sample]) -> Evaluation:
 
 
 FORCE_COMPARISON = Experiment(
-    "complete and reduced model", measure_forces,
+    "complete and reduced model", compare_model_forces,
     (
         Claim(
             "simulated motions", "Simulated trajectory of the swing, the boom, the stick (axes in"
@@ -199,7 +199,7 @@ FORCE_COMPARISON = Experiment(
             '"neglecting the dynamics of the minor links (hydraulic actuators) may overestimate or'
             " underestimate the forces/torques applied to the joints/links of the arm by a factor"
             ' of two or more."',
-            "Fig. 33, pp. 105 and 123", "document", evaluate_force_factor,
+            "Fig. 33, pp. 105 and 123", "document", evaluate_factor_between_forces,
             fault={"cylinder_scale": 0.0}, fault_description="cylinders without mass",
             panel_labels=FORCE_LABELS,
         ),
@@ -228,7 +228,7 @@ PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
 """The same counts for cylinders with pins, computed by this project."""
 
 
-def count_parameters(classification: Identifiability) -> dict[str, int]:
+def count_identifiability_classes(classification: Identifiability) -> dict[str, int]:
     """Count the unidentifiable, linearly identifiable and fully identifiable parameters.
 
     Columns without effect and columns that depend linearly on others are deleted and count as
@@ -257,13 +257,13 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
         Counts of the classes, and the relative singular values on either side of the rank.
     """
     settings = merge_settings(COUNT_SETTINGS, changes)
-    states = draw_states(settings["states"], seed)
+    states = sample_states(settings["states"], seed)
     values = {}
     for kind, ball in (("document", settings["ball_joints"]), ("pins", not settings["pins"])):
-        setup = make_document_setup("complete", ball, settings["tilt_deg"])
+        setup = make_thesis_regressor_setup("complete", ball, settings["tilt_deg"])
         table = make_regressor(setup, states)
         told = classify_parameters(stack_rows(table), table.names, table.units)
-        values |= {f"{kind}.{name}": n for name, n in count_parameters(told).items()}
+        values |= {f"{kind}.{name}": n for name, n in count_identifiability_classes(told).items()}
         values |= {
             f"{kind}.smallest": told.singular_value_gap[0],
             f"{kind}.next": told.singular_value_gap[1],
@@ -277,13 +277,13 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
     return Sample(values)
 
 
-def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_identifiability_counts(samples: Sequence[Sample]) -> Evaluation:
     """Compare the numbers of unidentifiable and identifiable parameters with Khoshzaban 1992, Table 13."""
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
              "full": "fully identifiable"}  # fmt: skip
     checks = tuple(
-        check_exact(f"{words[name]} parameters", values[f"document.{name}"], (n, n),
+        check_deterministic_value(f"{words[name]} parameters", values[f"document.{name}"], (n, n),
                     "a count", published=n)
         for name, n in TABLE_13.items()
     )  # fmt: skip
@@ -298,12 +298,12 @@ def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_pin_counts(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_counts_with_pin_joints(samples: Sequence[Sample]) -> Evaluation:
     """Check the numbers of unidentifiable and identifiable parameters for cylinders that end in pins."""
     values = samples[0].values
     return Evaluation(
         tuple(
-            check_exact(f"{name} parameters", values[f"pins.{name}"], (n, n), "a count")
+            check_deterministic_value(f"{name} parameters", values[f"pins.{name}"], (n, n), "a count")
             for name, n in PIN_COUNTS.items()
         )
     )
@@ -314,11 +314,11 @@ def evaluate_swing_parameters(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation(
         (
-            check_exact("parameters without effect", values["document.without_effect"], (9, 9),
+            check_deterministic_value("parameters without effect", values["document.without_effect"], (9, 9),
                         "the first nine of the swing", published=9),
-            check_exact("they are the first nine of the swing",
+            check_deterministic_value("they are the first nine of the swing",
                         values["document.first_nine_lost"], (1, 1), "1: yes"),
-            check_exact("Izz of the swing is identifiable in a combination",
+            check_deterministic_value("Izz of the swing is identifiable in a combination",
                         values["document.swing_combined"], (1, 1), "1: yes"),
         ),
     )  # fmt: skip
@@ -332,14 +332,14 @@ IDENTIFIABILITY = Experiment(
             '"the 31 unidentifiable parameters in Table 13 are marked with "*", the 24 linearly'
             ' identifiable ones are marked with "f", and the 27 fully identifiable parameters are'
             ' marked with "t"."',
-            "Table 13, pp. 106 and 107", "document", evaluate_table_13,
+            "Table 13, pp. 106 and 107", "document", evaluate_identifiability_counts,
             fault={"ball_joints": False}, fault_description="cylinders that end in pins",
         ),
         Claim(
             "identifiability with pins",
             "With cylinders that end in pins, 37 of the 82 parameters are unidentifiable, 25"
             " linearly identifiable and 20 fully identifiable.",
-            "supplement to Table 13", "additional", evaluate_pin_counts,
+            "supplement to Table 13", "additional", evaluate_counts_with_pin_joints,
             fault={"pins": False}, fault_description="cylinders that end in ball joints",
         ),
         Claim(

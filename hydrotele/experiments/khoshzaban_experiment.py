@@ -14,10 +14,10 @@ from hydrotele.calibrate.loop import build_loop
 from hydrotele.experiments import khoshzaban_linkages
 from hydrotele.experiments.comparison import Changes, Check, Claim, Evaluation, Experiment, Sample, merge_settings
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
-    check_population,
-    check_statistic,
+    check_published_in_population,
     collect_values,
 )
 from hydrotele.experiments.khoshzaban_arm import (
@@ -36,7 +36,7 @@ from hydrotele.experiments.khoshzaban_calibration import (
     ArmModel,
     compute_end_position,
     measure_bend_detection,
-    measure_calibration,
+    measure_calibration_errors,
 )
 from hydrotele.machine.machine_file import load_machine
 
@@ -83,7 +83,7 @@ def find_printed_length_errors(model: str) -> dict[str, float]:
     return {n: v - NOMINAL_LENGTHS[n] for n, v in zip(LENGTH_PARAMETERS, _PRINTED_LENGTHS[model], strict=True)}
 
 
-def compute_accepted_change(ratio: float) -> tuple[float, float]:
+def compute_accepted_ratio_range(ratio: float) -> tuple[float, float]:
     """Return the range of error ratios whose decrease is half to twice the published one.
 
     Args:
@@ -95,7 +95,7 @@ def compute_accepted_change(ratio: float) -> tuple[float, float]:
 CHANGE_REASON = "half to twice the published decrease of one measurement"
 
 
-def measure_printed_parameters(seed: int, changes: Changes) -> Sample:
+def measure_printed_end_point_errors(seed: int, changes: Changes) -> Sample:
     """Compute how far end points with the printed parameters are from those of the nominal model.
 
     Joint angles are exact.
@@ -133,13 +133,13 @@ def measure_printed_parameters(seed: int, changes: Changes) -> Sample:
     return Sample(values)
 
 
-def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_printed_end_point_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check whether the printed parameters reproduce the printed position errors of the end points."""
     checks = []
     for (model, side), ends in PUBLISHED_POSITION_ERRORS.items():
         for end, published in ends.items():
             table = 7 if model == "identified" else 9
-            checks.append(check_exact(
+            checks.append(check_deterministic_value(
                 f"{end}'s end, Table {table}, from the {side} side",
                 samples[0].values[f"{model}.{side}.{end}"],
                 (0.7 * published, 1.3 * published) if published else (0.0, 0.0005),
@@ -155,7 +155,7 @@ def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_identified_parameter_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the parameter errors identified from all poses with Khoshzaban 1992, Table 7.
 
     Published RMS errors must be typical of the repetitions.
@@ -163,11 +163,11 @@ def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
     outer = np.array([[s.values[f"identified.error.{n}"] for n in _PRINTED_OUTER] for s in samples])
     offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSET_PARAMETERS] for s in samples])
     checks = (
-        *_check_links(samples, "identified"),
-        check_population("RMS error of a4, a5, d5", 1e3 * _compute_row_rms(outer),
+        *_check_link_parameter_errors(samples, "identified"),
+        check_published_in_population("RMS error of a4, a5, d5", 1e3 * _compute_row_rms(outer),
                          1e3 * compute_rms(list(_PRINTED_OUTER.values())), "mm"),
-        check_population("RMS error of the offsets of joints 5 to 7", np.degrees(_compute_row_rms(offsets)),
-                         compute_rms(_PRINTED_OFFSETS), "deg"),
+        check_published_in_population("RMS error of the offsets of joints 5 to 7",
+                         np.degrees(_compute_row_rms(offsets)), compute_rms(_PRINTED_OFFSETS), "deg"),
     )  # fmt: skip
     return Evaluation(
         checks,
@@ -175,7 +175,7 @@ def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
         " which are identified before, come only from sensor noise and drift; the thesis' offsets"
         " of 8.6 and 4.2 deg are those of misaligned sensors. Bends of 6 to 12 deg instead of 2 to"
         " 6 deg cause errors of 81 mm and 4.8 deg in links 0 to 3",
-        _describe_links(samples, "identified"),
+        _describe_link_parameter_errors(samples, "identified"),
     )
 
 
@@ -192,19 +192,19 @@ def _compute_row_rms(rows: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(rows**2, axis=1))
 
 
-def _check_links(samples: Sequence[Sample], model: str) -> list[Check]:
+def _check_link_parameter_errors(samples: Sequence[Sample], model: str) -> list[Check]:
     """Return checks whether published RMS errors of lengths and twists of links 0 to 3 are typical."""
     lengths = compute_rms(list(find_printed_length_errors(model).values()))
     return [
-        check_population("RMS error of the six lengths of links 0 to 3",
+        check_published_in_population("RMS error of the six lengths of links 0 to 3",
                          1e3 * collect_values(samples, f"{model}.lengths"), 1e3 * lengths, "mm"),
-        check_population("RMS error of alpha and beta of links 1 to 3",
+        check_published_in_population("RMS error of alpha and beta of links 1 to 3",
                          np.degrees(collect_values(samples, f"{model}.twists")),
                          compute_rms(_PRINTED_TWISTS[model]), "deg"),
     ]  # fmt: skip
 
 
-def _describe_links(samples: Sequence[Sample], model: str) -> str:
+def _describe_link_parameter_errors(samples: Sequence[Sample], model: str) -> str:
     """Return mean, standard deviation and published value of each parameter error as text."""
     parts = []
     for name, published in find_printed_length_errors(model).items():
@@ -224,12 +224,12 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
         ratio = abs(after[name] / before[name])
         checks.append(check_rms_ratio(
             f"error of {LENGTH_SYMBOLS[name]} over that of Table 7", samples,
-            (f"reidentified.error.{name}", f"identified.error.{name}"), compute_accepted_change(ratio),
+            (f"reidentified.error.{name}", f"identified.error.{name}"), compute_accepted_ratio_range(ratio),
             CHANGE_REASON, ratio,
         ))  # fmt: skip
     for kind in ("alpha", "beta"):
         ratio = _compute_printed_twist_rms("reidentified", kind) / _compute_printed_twist_rms("identified", kind)
-        accepted = compute_accepted_change(ratio) if ratio < 1.0 else (1.0, np.inf)
+        accepted = compute_accepted_ratio_range(ratio) if ratio < 1.0 else (1.0, np.inf)
         checks.append(check_rms_ratio(
             f"error of {kind} over that of Table 7", samples,
             (f"reidentified.{kind}", f"identified.{kind}"), accepted,
@@ -249,10 +249,10 @@ def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
     Published RMS errors must be typical of the repetitions.
     """
     return Evaluation(
-        tuple(_check_links(samples, "reidentified")),
+        tuple(_check_link_parameter_errors(samples, "reidentified")),
         "after the removal only sensor noise affects alpha and beta here; the thesis also names"
         " sensor misalignment as a cause (p. 65), which is not simulated",
-        _describe_links(samples, "reidentified"),
+        _describe_link_parameter_errors(samples, "reidentified"),
     )
 
 
@@ -264,7 +264,7 @@ def _compute_printed_twist_rms(model: str, kind: str) -> float:
 def _check_rms_errors(samples: Sequence[Sample], model: str, side: str, published: dict, name: str) -> list[Check]:
     """Return checks whether the published RMS error of each end point is typical of the repetitions."""
     return [
-        check_population(f"{end}'s end, {model}, {side} side",
+        check_published_in_population(f"{end}'s end, {model}, {side} side",
                          1e3 * collect_values(samples, name.format(model=model, side=side, end=end)),
                          1e3 * size, "mm")
         for end, size in published[model, side].items() if size
@@ -274,7 +274,7 @@ def _check_rms_errors(samples: Sequence[Sample], model: str, side: str, publishe
 _POSITION_KEY, _DISTANCE_KEY = "{model}.position.{side}.{end}", "{model}.{side}.{end}.rms"
 
 
-def _check_decrease(
+def _check_error_decrease(
     samples: Sequence[Sample], names: tuple[str, str], published: dict, side: str, name: str
 ) -> list[Check]:
     """Return checks whether end-point errors decrease from one model to another as much as published."""
@@ -285,7 +285,7 @@ def _check_decrease(
         ratio = after / before
         checks.append(check_rms_ratio(
             f"{end}'s end, {names[1]} over {names[0]}", samples, (keys[0], keys[1]),
-            compute_accepted_change(ratio), CHANGE_REASON, ratio,
+            compute_accepted_ratio_range(ratio), CHANGE_REASON, ratio,
         ))  # fmt: skip
     return checks
 
@@ -310,12 +310,12 @@ def evaluate_position_decrease(samples: Sequence[Sample]) -> Evaluation:
     """
     names = ("identified", "reidentified")
     return Evaluation(
-        tuple(_check_decrease(samples, names, PUBLISHED_POSITION_ERRORS, "manipulator", _POSITION_KEY)),
+        tuple(_check_error_decrease(samples, names, PUBLISHED_POSITION_ERRORS, "manipulator", _POSITION_KEY)),
         "the drift of held links remains: without drift the error of the stick's end decreases from 0.076 to 0.031 m",
     )
 
 
-def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_calibrator_end_points(samples: Sequence[Sample]) -> Evaluation:
     """Compare position errors of end points, computed from the calibrator's joints, with the thesis.
 
     The errors are relative to the nominal model (Khoshzaban 1992, pp. 67 and 71).
@@ -327,7 +327,7 @@ def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
         for check in _check_rms_errors(samples, model, "calibrator", PUBLISHED_POSITION_ERRORS, _POSITION_KEY)
     ]
     checks += [
-        check_exact(f"largest of the grapple's end, {model}",
+        check_deterministic_value(f"largest of the grapple's end, {model}",
                     float(collect_values(samples, f"{model}.position.calibrator.grapple").max()),
                     (0.0, 0.0005), "printed as 0.000", unit="m", published=0.0)
         for model in models
@@ -339,7 +339,7 @@ def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
             "stick's end, reidentified over identified",
             samples,
             (stick[0], stick[1]),
-            compute_accepted_change(ratio),
+            compute_accepted_ratio_range(ratio),
             CHANGE_REASON,
             ratio,
         )
@@ -373,7 +373,7 @@ def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_model_order(samples: Sequence[Sample]) -> Evaluation:
+def compare_nominal_and_identified_distances(samples: Sequence[Sample]) -> Evaluation:
     """Check that the identified model has larger distance errors than the nominal one, as in Fig. 19.
 
     Its error must also decrease with the distance from the end point to the ball (Khoshzaban 1992).
@@ -423,12 +423,12 @@ def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
     stick = 0.021 / 0.026
     checks.append(check_rms_ratio(
         "stick's end, identified over nominal", samples,
-        ("identified.calibrator.stick.rms", "nominal.calibrator.stick.rms"), compute_accepted_change(stick),
+        ("identified.calibrator.stick.rms", "nominal.calibrator.stick.rms"), compute_accepted_ratio_range(stick),
         CHANGE_REASON, stick,
     ))  # fmt: skip
     same = [abs(s.values["identified.calibrator.grapple.rms"]
                 - s.values["nominal.calibrator.grapple.rms"]) for s in samples]  # fmt: skip
-    checks.append(check_exact("grapple's end, largest difference of both models", max(same),
+    checks.append(check_deterministic_value("grapple's end, largest difference of both models", max(same),
                               (0.0, 0.0005), "printed with the same three digits", unit="m",
                               published=0.0))  # fmt: skip
     return Evaluation(
@@ -440,7 +440,7 @@ def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_reidentified_distances(samples: Sequence[Sample]) -> Evaluation:
     """Compare the distance errors of the model identified without bent poses with Khoshzaban 1992, Table 10."""
     return Evaluation(
         tuple(_check_rms_errors(samples, "reidentified", "manipulator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)),
@@ -456,17 +456,17 @@ def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
     calibrator's joints must stay the same.
     """
     models = ("identified", "reidentified")
-    checks = _check_decrease(samples, models, PUBLISHED_DISTANCE_ERRORS, "manipulator", _DISTANCE_KEY)
+    checks = _check_error_decrease(samples, models, PUBLISHED_DISTANCE_ERRORS, "manipulator", _DISTANCE_KEY)
     for end in END_POINT_LINKS:
         change = [abs(s.values[f"reidentified.calibrator.{end}.rms"]
                       - s.values[f"identified.calibrator.{end}.rms"]) for s in samples]  # fmt: skip
-        checks.append(check_exact(f"{end}'s end, calibrator side, largest change", max(change),
+        checks.append(check_deterministic_value(f"{end}'s end, calibrator side, largest change", max(change),
                                   (0.0, 0.0005), "printed with the same three digits", unit="m",
                                   published=0.0))  # fmt: skip
     return Evaluation(tuple(checks))
 
 
-def evaluate_sensor_outputs(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_predicted_readings(samples: Sequence[Sample]) -> Evaluation:
     """Check that predicted and actual readings differ at joints 5 and 6 when the stick is retracted.
 
     Joints 7 and 8 must agree (Khoshzaban 1992, Figs 20 and 21).
@@ -480,9 +480,9 @@ def evaluate_sensor_outputs(samples: Sequence[Sample]) -> Evaluation:
         ))  # fmt: skip
     for joint in (7, 8):
         rows = np.column_stack([collect_values(samples, f"inside.{k}") for k in (joint, 5, 6)])
-        checks.append(check_statistic(
+        checks.append(check_bootstrapped_statistic(
             f"difference at joint {joint} over the smaller one of joints 5 and 6, stick retracted",
-            rows, _compute_worst_ratio, (0.0, 0.5),
+            rows, _compute_ratio_to_smaller_rms, (0.0, 0.5),
             "good agreement against a large discrepancy: at most half",
         ))  # fmt: skip
     sizes = ", ".join(f"{k}: {compute_rms(collect_values(samples, f'inside.{k}')):.2f} and"
@@ -497,7 +497,7 @@ def evaluate_sensor_outputs(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def _compute_worst_ratio(rows: np.ndarray) -> float:
+def _compute_ratio_to_smaller_rms(rows: np.ndarray) -> float:
     rms = np.sqrt(np.mean(rows**2, axis=0))
     return float(rms[0] / min(rms[1:]))
 
@@ -519,22 +519,22 @@ def evaluate_bend_detection(samples: Sequence[Sample]) -> Evaluation:
 
 
 EXPERIMENTS = (
-    Experiment("printed parameters", measure_printed_parameters, (
+    Experiment("printed parameters", measure_printed_end_point_errors, (
         Claim(
             "end points with the printed parameters",
             "RMS position errors relative to the nominal model: Table 7 0.212 m (stick) and 0.256"
             " m (grapple) from the manipulator side, 0.542 and 0.000 m from the calibrator side;"
             " Table 9 0.153, 0.205, 0.373 and 0.000 m",
-            "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", evaluate_printed_parameters,
+            "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", evaluate_printed_end_point_errors,
             {"table_9": "identified"}, "Table 7's parameters replace those of Table 9",
         ),
     ), fixed_repetitions=1),
-    Experiment("calibration with bent joints", measure_calibration, (
+    Experiment("calibration with bent joints", measure_calibration_errors, (
         Claim(
             "identified parameters",
             "a1 0.011, a2 5.485, a3 1.868, d0 0.623, d2 0.001 m; alpha 1 to 3 -84.5, -4.7, -3.6,"
             " beta 2 and 3 -2.0, -1.3 deg; offsets of joints 5 to 7 8.6, 4.2, 0.7 deg",
-            "Table 7, section 3.8.1, pp. 62-63", "document", evaluate_parameters, NO_FAULTS,
+            "Table 7, section 3.8.1, pp. 62-63", "document", evaluate_identified_parameter_errors, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -578,7 +578,7 @@ EXPERIMENTS = (
             "end points, calibrator side",
             "RMS position error relative to the nominal model: 0.542 m (stick) and 0.000 m"
             " (grapple), without the bad data 0.373 and 0.000 m",
-            "Tables 7 and 9, pp. 67, 71", "document", evaluate_calibrator_ends, NO_FAULTS,
+            "Tables 7 and 9, pp. 67, 71", "document", evaluate_calibrator_end_points, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -593,7 +593,7 @@ EXPERIMENTS = (
             '"the distance error for the nominal model is less than that of the identified model'
             ' and decreases for the identified model when the manipulator stretches its arms":'
             " 0.036 against 0.162 m and 0.066 against 0.217 m",
-            "Fig. 19, pp. 65-66", "document", evaluate_model_order, NO_FAULTS,
+            "Fig. 19, pp. 65-66", "document", compare_nominal_and_identified_distances, NO_FAULTS,
             "joints do not bend and held links do not drift", ("stick's end to the ball [m]",),
         ),
         Claim(
@@ -607,7 +607,7 @@ EXPERIMENTS = (
         Claim(
             "distances, re-identified",
             "manipulator side: RMS 0.101 m (stick) and 0.125 m (grapple), VAF 98.87, 99.07 %",
-            "Table 10, p. 71", "document", evaluate_new_distances, NO_FAULTS,
+            "Table 10, p. 71", "document", evaluate_reidentified_distances, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -622,7 +622,7 @@ EXPERIMENTS = (
             '"There is good agreement between the simulated and the actual sensor readings for'
             ' Joints 7 and 8"; "there is a large discrepancy between the actual and the simulated'
             ' sensor readings for Joints 5 and 6" where the stick is pulled in',
-            "Figs 20 and 21, section 3.8.2, pp. 67-69", "document", evaluate_sensor_outputs,
+            "Figs 20 and 21, section 3.8.2, pp. 67-69", "document", evaluate_predicted_readings,
             {"bent": ("calibrator_twist", "calibrator_elbow")}, "joints 7 and 8 bend instead",
             ("stick angle [deg]", "joint 5, grapple [deg]", "joint 6, calibrator_yoke [deg]",
              "joint 7, calibrator_twist [deg]", "joint 8, calibrator_elbow [deg]"),

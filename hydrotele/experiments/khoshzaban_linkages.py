@@ -14,9 +14,9 @@ import numpy as np
 from hydrotele.calibrate.linkage import PARAMETER_NAMES
 from hydrotele.experiments.comparison import Claim, Evaluation, Sample
 from hydrotele.experiments.intervals import (
+    check_bootstrapped_statistic,
     check_mean,
-    check_population,
-    check_statistic,
+    check_published_in_population,
     collect_values,
 )
 from hydrotele.experiments.khoshzaban_arm import check_rms_ratio, compute_rms
@@ -43,7 +43,7 @@ def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
     checks = []
     for axis in ("boom", "stick"):
         checks += [
-            check_population(f"{name} of the {axis} minus the taped length",
+            check_published_in_population(f"{name} of the {axis} minus the taped length",
                              1e3 * collect_values(samples, f"{axis}.{kind}.{name}"), 1e3 * published, "mm",
                              log=False)
             for name, published in _PRINTED_LENGTH_ERRORS[axis, kind].items()
@@ -78,7 +78,7 @@ def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
     return f"mean deviations from the tape's triangle: {', '.join(parts)}"
 
 
-def evaluate_angle_sources(samples: Sequence[Sample]) -> Evaluation:
+def compare_measured_and_computed_angles(samples: Sequence[Sample]) -> Evaluation:
     """Check that measured joint angles give more accurate cylinder triangles than computed angles.
 
     Khoshzaban 1992, p. 77, says so; computed angles follow from the calibrator's readings.
@@ -93,7 +93,7 @@ def evaluate_angle_sources(samples: Sequence[Sample]) -> Evaluation:
             compute_rms([_PRINTED_LENGTH_ERRORS[axis, kind].get(n, 0.0) for n in ("l_l", "l_c", "l_u")])
             for kind in ("measured", "identified")
         ]
-        checks.append(check_statistic(
+        checks.append(check_bootstrapped_statistic(
             f"error of the {axis}'s lengths from measured over that from computed angles", rows,
             lambda r: compute_rms(r[:, 0]) / compute_rms(r[:, 1]), (0.0, 1.0), "closer",
             published=sizes[0] / sizes[1],
@@ -114,7 +114,7 @@ def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
         kind: source of the joint angles, `measured` or `identified` (computed from the calibrator).
     """
     checks = [
-        check_statistic(f"RMS error of the {axis}", 1e3 * collect_values(samples, f"{axis}.{kind}.rms"),
+        check_bootstrapped_statistic(f"RMS error of the {axis}", 1e3 * collect_values(samples, f"{axis}.{kind}.rms"),
                         compute_rms, (0.5e3 * published, 2e3 * published),
                         "a factor of 2 around one measurement", unit="mm",
                         published=1e3 * published)
@@ -163,7 +163,7 @@ CLAIMS = (
         "measured angles give the nearer triangles",
         '"the identified parameters obtained using measured (sensed) joint angles are generally'
         ' closer to the actual parameters than those using computed joint angles"',
-        "Table 11, p. 77", "document", evaluate_angle_sources, {"transducer": 0.02},
+        "Table 11, p. 77", "document", compare_measured_and_computed_angles, {"transducer": 0.02},
         "errors of the linear transducers are ten times as large", (),
     ),
     Claim(

@@ -25,12 +25,12 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_exact, collect_values
+from hydrotele.experiments.intervals import check_deterministic_value, collect_values
 from hydrotele.experiments.khoshzaban_arm import (
     IDENTIFIABLE_PARAMETERS,
     SIMULATED_STAGES,
 )
-from hydrotele.experiments.scenario_runs import run_shipped
+from hydrotele.experiments.scenario_runs import run_shipped_scenario
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine import Machine
@@ -51,7 +51,7 @@ _TRIANGLE_NAMES = ("l_l", "l_u", "l_c", "offset")
 _PUBLISHED_FORCE_ERRORS = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
 
 
-def measure_machine(seed: int, changes: Changes) -> Sample:
+def read_machine_dimensions(seed: int, changes: Changes) -> Sample:
     """Read masses and dimensions from the machine model.
 
     Args:
@@ -86,7 +86,7 @@ def measure_machine(seed: int, changes: Changes) -> Sample:
                  abs(math.degrees(linkage.angle_offset)))  # fmt: skip
         values |= {f"{n}.{name}": v for n, v in zip(_TRIANGLE_NAMES, found, strict=True)}
     for name in _PUBLISHED_FORCE_ERRORS:
-        areas = machine.axes[name].hydraulic_drive.areas
+        areas = machine.axes[name].hydraulic_drive.effective_areas
         values[f"torque.{name}"] = 25.0 * PSI * (areas[0] + areas[1])
     return Sample(values)
 
@@ -133,7 +133,7 @@ def _check_published_value(
     quantity: str, value: float, published: float, tolerance: float, reason: str, unit: str
 ) -> Check:
     accepted = (published - tolerance, published + tolerance)
-    return check_exact(quantity, value, accepted, reason, unit=unit, published=published)
+    return check_deterministic_value(quantity, value, accepted, reason, unit=unit, published=published)
 
 
 def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
@@ -153,7 +153,7 @@ def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_plates(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_pin_distances(samples: Sequence[Sample]) -> Evaluation:
     """Compare the pin distances of the model's boom and stick with Khoshzaban 1992, Figs 5 and 6."""
     values, digit = samples[0].values, "last printed digit"
     # The model uses L1 = 5.180 m of Table 2; Fig. 5 has 5.190 m, which changes L3 by 9.5 mm.
@@ -202,15 +202,15 @@ def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
     ))  # fmt: skip
 
 
-def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_dh_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Compare the model's Denavit-Hartenberg parameters with Khoshzaban 1992, Table 2."""
-    return Evaluation((check_exact(
+    return Evaluation((check_deterministic_value(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
     ),))  # fmt: skip
 
 
-def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_force_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the torque and force errors due to pressure errors of 25 psi with Khoshzaban 1992, Eq. 4.61."""
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
@@ -219,7 +219,7 @@ def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
     ))  # fmt: skip
 
 
-def measure_identifiable_lists(seed: int, changes: Changes) -> Sample:
+def find_identifiable_parameters(seed: int, changes: Changes) -> Sample:
     """Find which parameters are identifiable in each calibration stage, and compare them with the thesis.
 
     Args:
@@ -248,17 +248,17 @@ def measure_identifiable_lists(seed: int, changes: Changes) -> Sample:
     )
 
 
-def evaluate_identifiable_lists(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_identifiable_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Check that the identifiable parameters of each stage are those of Khoshzaban 1992, section 3.6.4."""
     return Evaluation(tuple(
-        check_exact(f"parameters of the {link} stage that are in one list only",
+        check_deterministic_value(f"parameters of the {link} stage that are in one list only",
                     samples[0].values[f"different.{link}"], (0.0, 0.0), "the same lists",
                     published=0.0)
         for link in IDENTIFIABLE_PARAMETERS
     ), note="links 6 to 8 are assumed known to 1 mm and 0.05 deg from the laboratory")  # fmt: skip
 
 
-def measure_drift(seed: int, changes: Changes) -> Sample:
+def measure_held_link_drift(seed: int, changes: Changes) -> Sample:
     """Simulate each calibration stage in MuJoCo, and record how far the held links drift.
 
     Args:
@@ -273,7 +273,7 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
     changes = {key: value for key, value in changes.items() if key not in loop.parameter_names}
     panels, values, gap = [], {}, 0.0
     for link in SIMULATED_STAGES:
-        _, run = run_shipped(f"calibrate_{link}", changes)
+        _, run = run_shipped_scenario(f"calibrate_{link}", changes)
         truth = run.truth
         gap = max(gap, _compute_closure_error(loop, truth))
         held = [name for name in ("swing", "boom", "stick") if name != link]
@@ -301,17 +301,17 @@ _PUBLISHED_DRIFT = {
 """Read from the axes of Figs 16(b), 17(c), 18(b) and 18(c) [deg]."""
 
 
-def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_held_link_drift(samples: Sequence[Sample]) -> Evaluation:
     """Compare how far held links drift while one link moves with Khoshzaban 1992, Figs 16 to 18."""
     values = samples[0].values
     checks = [
-        check_exact(f"drift of the {name}", values[name], (0.2, 1.6),
+        check_deterministic_value(f"drift of the {name}", values[name], (0.2, 1.6),
                     "a factor of 2 around 0.4 to 0.8 deg, measured on one worn machine", unit="deg",
                     published=published)
         for name, published in _PUBLISHED_DRIFT.items()
     ]  # fmt: skip
     checks += [
-        check_exact(f"drift of the {name}", value, (0.0, 360.0 / 2**14),
+        check_deterministic_value(f"drift of the {name}", value, (0.0, 360.0 / 2**14),
                     "a step of the 14-bit resolver converter (p. 21): Figs 16(a) and 17(a) show"
                     " less than one", unit="deg", published=0.0)
         for name, value in values.items() if name.startswith("swing while")
@@ -328,20 +328,20 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_closure(samples: Sequence[Sample]) -> Evaluation:
     """Check that the chain of Khoshzaban 1992, Table 2 closes for joint angles of the MuJoCo model."""
     return Evaluation((
-        check_exact("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
+        check_deterministic_value("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
                     "0.01 mm, much smaller than all errors in this study", unit="um"),
     ))  # fmt: skip
 
 
 EXPERIMENTS = (
-    Experiment("dimensions", measure_machine, (
+    Experiment("dimensions", read_machine_dimensions, (
         Claim("masses of the links", "M 8031, 1830, 688 kg; k_x 2.30 and 0.90, k_y 0.2 and 0.1 m",
               "Table 1, p. 18", "input", evaluate_masses, {"links.boom.mass": 1900.0},
               "a heavier boom"),
         Claim("plates of boom and stick",
               "boom: L1 = 5.190, L2 = 2.000, L3 = 3.790, L4 = 2.443 m, gamma = 37.0 deg; stick:"
               " L1 = 1.800, L2 = 0.720, L3 = 2.425 m, gamma = 35 deg",
-              "Figs 5 and 6, pp. 14-15", "input", evaluate_plates,
+              "Figs 5 and 6, pp. 14-15", "input", evaluate_pin_distances,
               {"axes.boom.cylinder.rod_pin.position": (1.88, 0.0, 0.684)},
               "the boom's rod pin 20 deg from its chord"),
         Claim("cylinder triangles",
@@ -358,26 +358,26 @@ EXPERIMENTS = (
         Claim("Denavit-Hartenberg parameters of machine and calibrator",
               "36 numbers of nine frames, among them a1 = 0.340, d2 = -0.110, a2 = 5.180, d5 ="
               " 1.134, d7 = 2.994, a8 = 3.505 m",
-              "Table 2, p. 56; Figs 4, 7 and 15, pp. 13, 16, 53", "input", evaluate_chain,
+              "Table 2, p. 56; Figs 4, 7 and 15, pp. 13, 16, 53", "input", evaluate_dh_parameters,
               {"links.stick.position": (5.19, 0.0, 0.0)}, "the boom's length of Fig. 5"),
         Claim("error of torque and force from pressures within 25 psi",
               "about 1400 N m (swing), 5700 N (boom), 4200 N (stick)",
-              "section 4.4.3, p. 108", "input", evaluate_pressures,
+              "section 4.4.3, p. 108", "input", evaluate_force_errors,
               {"axes.boom.cylinder.area_head": 0.01}, "a smaller boom cylinder"),
     ), fixed_repetitions=1),
-    Experiment("identifiable parameters", measure_identifiable_lists, (
+    Experiment("identifiable parameters", find_identifiable_parameters, (
         Claim("identifiable parameters of each stage",
               "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3"
               " and 2: the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
               " a1; in addition, the ball's p_xy and p_z",
-              "section 3.6.4, pp. 54-56", "document", evaluate_identifiable_lists, {"wander": 0.0},
+              "section 3.6.4, pp. 54-56", "document", evaluate_identifiable_parameters, {"wander": 0.0},
               "the grapple does not rotate"),
     ), fixed_repetitions=1),
-    Experiment("held links", measure_drift, (
+    Experiment("held links", measure_held_link_drift, (
         Claim("held links drift while one moves",
               '"there will be a drift at the endpoint of each link which is actuated by a hydraulic'
               ' jack": 0.4 to 0.8 deg of boom and stick in the figures, none of the swing',
-              "Figs 16 to 18, section 3.7.1, pp. 57-59", "document", evaluate_drift,
+              "Figs 16 to 18, section 3.7.1, pp. 57-59", "document", evaluate_held_link_drift,
               {"pilot.closed_valves": "[]"}, "the servo holds the links instead of closed valves"),
         Claim("closure of the kinematic chain",
               "the chain of Table 2 closes on the angles of the MuJoCo model",

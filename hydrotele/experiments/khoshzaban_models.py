@@ -38,7 +38,7 @@ Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @cache
-def make_document_setup(
+def make_thesis_regressor_setup(
     model: DynamicModel = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
 ) -> RegressorSetup:
     """Return the setup of the regressor in Khoshzaban 1992, chapter 4, for the CAT 215.
@@ -67,7 +67,7 @@ def make_document_setup(
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
     """Compute the regressor of the drive forces along a motion."""
-    return setup.compute_regressor(setup.project(*motion))
+    return setup.compute_regressor(setup.project_motion_on_drives(*motion))
 
 
 def stack_rows(table: Regressor) -> np.ndarray:
@@ -75,7 +75,7 @@ def stack_rows(table: Regressor) -> np.ndarray:
     return table.matrix.reshape(-1, len(table.names))
 
 
-def draw_states(count: int, seed: int = 0) -> Motion:
+def sample_states(count: int, seed: int = 0) -> Motion:
     """Draw independent random poses, rates and accelerations that excite all parameters.
 
     Args:
@@ -92,7 +92,7 @@ def draw_states(count: int, seed: int = 0) -> Motion:
             rng.uniform(-2.0, 2.0, (count, 3)))  # fmt: skip
 
 
-def draw_motion(rng: np.random.Generator) -> Motion:
+def sample_motion(rng: np.random.Generator) -> Motion:
     """Draw a random motion of swing, boom and stick within the axis limits of Khoshzaban 1992, Figs 30 to 32.
 
     The curves are not legible in the available text. Start, end and largest rate are drawn within
@@ -125,7 +125,7 @@ def join_motions(motions: Sequence[Motion]) -> Motion:
     return position, rate, acceleration
 
 
-def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None = None):
+def scale_cylinder_inertia(table: Regressor, scale: float, bodies: Sequence[str] | None = None):
     """Return the parameters (m,) with the inertial parameters of the cylinders' tubes and rods scaled.
 
     Args:
@@ -187,18 +187,18 @@ _RANDOM_STATES = 300  # random states; each gives three equations for at most 82
 
 
 @cache
-def find_base(model: DynamicModel, ball_joints: bool = True) -> BaseParameters:
+def find_base_parameters(model: DynamicModel, ball_joints: bool = True) -> BaseParameters:
     """Find the base parameters of the complete or the reduced model from its regressor at random states.
 
     Args:
         model: `complete` or `reduced`.
-        ball_joints: see `make_document_setup`.
+        ball_joints: see `make_thesis_regressor_setup`.
 
     Returns:
         The base parameters.
     """
-    setup = make_document_setup(model, ball_joints)
-    table = make_regressor(setup, draw_states(_RANDOM_STATES))
+    setup = make_thesis_regressor_setup(model, ball_joints)
+    table = make_regressor(setup, sample_states(_RANDOM_STATES))
     told = classify_parameters(stack_rows(table), table.names, table.units)
     usual = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     return BaseParameters(

@@ -14,11 +14,16 @@ from hydrotele.calibrate.flexibility import refit_with_flexibility
 from hydrotele.calibrate.loop import build_loop
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
-    draw_gravity_bends,
+    sample_gravity_bends,
     simulate_readings,
 )
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample, merge_settings
-from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic, collect_values
+from hydrotele.experiments.intervals import (
+    check_bootstrapped_statistic,
+    check_deterministic_value,
+    check_mean,
+    collect_values,
+)
 from hydrotele.experiments.khoshzaban_arm import LENGTH_PARAMETERS, SIMULATED_STAGES
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
@@ -31,7 +36,7 @@ LINKAGE_SETTINGS = {"axial_offset": 0.05}
 """Distance of the two pins of the boom's cylinder along the joint's axis [m]."""
 
 
-def measure_linkage(seed: int, changes: Changes) -> Sample:
+def count_undetermined_parameters(seed: int, changes: Changes) -> Sample:
     """Count the geometric parameters of a cylinder with ball joints that its sensors do not determine.
 
     The sensors are the piston displacement and zero, one or two angles of the cylinder at its base
@@ -57,7 +62,7 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
     for name, rows in sensors.items():
         start = np.array([*plane, *([offset] if offset else []), *(0.0 for _ in rows[1:])])
 
-        def read(x, rows=rows):
+        def predict_readings(x, rows=rows):
             angle, lower, upper, closed = x[:4]
             apart = x[4] if offset else 0.0
             bar = TwoBar(lower, upper, angle, linkage.direction, apart)
@@ -75,7 +80,7 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
         for k in range(len(start)):
             step = np.zeros(len(start))
             step[k] = _DIFFERENCE_STEP
-            columns.append((read(start + step) - read(start - step)) / (2.0 * _DIFFERENCE_STEP))
+            columns.append((predict_readings(start + step) - predict_readings(start - step)) / (2.0 * _DIFFERENCE_STEP))
         jacobian = np.array(columns).T
         jacobian /= np.linalg.norm(jacobian, axis=0)
         size = np.linalg.svd(jacobian, compute_uv=False)
@@ -84,10 +89,10 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
     return Sample(values | {"needed": float(needed)})
 
 
-def evaluate_linkage(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_needed_angle_sensors(samples: Sequence[Sample]) -> Evaluation:
     """Check that two angle sensors are needed to identify a cylinder with ball joints (Khoshzaban 1992, p. 43)."""
     v = samples[0].values
-    check = check_exact(
+    check = check_deterministic_value(
         "angle sensors needed in addition to the displacement", v["needed"], (2.0, 2.0),
         "the document's number", published=2.0,
     )  # fmt: skip
@@ -107,7 +112,7 @@ FLEXIBILITY_SETTINGS = {"bend": 1.0, "bent_share": 0.35, "estimated": True}
 and whether the noise model is estimated."""
 
 
-def measure_flexibility(seed: int, changes: Changes) -> Sample:
+def identify_with_flexibility_model(seed: int, changes: Changes) -> Sample:
     """Identify an arm with bent joints, without and with a noise model of flexible joints.
 
     Args:
@@ -124,7 +129,7 @@ def measure_flexibility(seed: int, changes: Changes) -> Sample:
     stages = []
     for link in SIMULATED_STAGES:
         clean = generate_sweep_poses(loop, link, DRIFT_FREE_SWEEPS[link], seed)
-        bend = draw_gravity_bends(loop, clean, rng, chosen["bend"], chosen["bent_share"], False)
+        bend = sample_gravity_bends(loop, clean, rng, chosen["bend"], chosen["bent_share"], False)
         stages.append(simulate_readings(loop, clean, rng, MAX_RESOLVER_ERROR, bend))
     plain = identify_arm(loop, stages)
     better, flexibility = plain, np.zeros(2)
@@ -145,7 +150,7 @@ def measure_flexibility(seed: int, changes: Changes) -> Sample:
 def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
     """Check that the noise model of flexible joints reduces length errors and gives correct 95 % intervals."""
     squares = np.column_stack([collect_values(samples, f"{n}_square") for n in ("modelled", "plain")])
-    ratio = check_statistic(
+    ratio = check_bootstrapped_statistic(
         "RMS error of the lengths, with over without the noise model", squares,
         lambda rows: float(np.sqrt(rows[:, 0].mean() / rows[:, 1].mean())), (0.0, 0.95),
         "improves: errors at least 5 % smaller",
@@ -165,19 +170,19 @@ def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
 
 
 EXPERIMENTS = (
-    Experiment("spatial linkage", measure_linkage, (
+    Experiment("spatial linkage", count_undetermined_parameters, (
         Claim(
             "cylinder with ball joints",
             "If joints A and C are 3-DOF ball joints, the triangle becomes a spatial closed chain,"
             " and two more joint angle sensors are required to identify the geometric parameters",
             "p. 43, section 3.4.4, Fig. 12",
             "document",
-            evaluate_linkage,
+            evaluate_needed_angle_sensors,
             {"axial_offset": 0.0},
             "pins in one plane: no angle sensor is needed",
         ),
     ), fixed_repetitions=1),
-    Experiment("flexible joints", measure_flexibility, (
+    Experiment("flexible joints", identify_with_flexibility_model, (
         Claim(
             "noise model of flexible joints",
             "A noise model of joint flexibility, which the thesis proposes for further work, is"

@@ -20,25 +20,25 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_mean, check_statistic, format_values
+from hydrotele.experiments.intervals import check_bootstrapped_statistic, check_mean, format_values
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
     SAMPLE_PERIOD,
     UNITS,
     BaseParameters,
     Motion,
-    find_base,
+    find_base_parameters,
     join_motions,
     make_regressor,
 )
 from hydrotele.experiments.khoshzaban_sensors import SENSOR_ACCURACY
 from hydrotele.identify.equations import predict_forces
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.identification import fit_runs
+from hydrotele.identify.identification import fit_base_parameters
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import IdentificationRecord, build_records
 from hydrotele.identify.setup import RegressorSetup, machine_setup
-from hydrotele.identify.smoothing import smooth
+from hydrotele.identify.smoothing import smooth_and_differentiate
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
@@ -93,7 +93,7 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     settings = merge_settings(SETTINGS, changes)
     rng = np.random.default_rng(seed)
     fit, heldout = (
-        [_add_errors(record, settings, rng) for record in part]
+        [_add_sensor_errors(record, settings, rng) for record in part]
         for part in _simulate_records(settings["swing_friction"])
     )
     learned, (judged,) = (
@@ -109,9 +109,9 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
         setup = machine_setup(machine, chain, model)
         if not settings["friction_identified"]:
             setup = replace(setup, friction_terms=())
-        found = fit_runs(fit, setup, Processing(), Estimator())
+        found = fit_base_parameters(fit, setup, Processing(), Estimator())
         predicted[model] = predict_forces(setup, np.stack(judged), found.expand_parameters())
-        base = find_base(model)
+        base = find_base_parameters(model)
         truth = _find_plant_parameters(base, settings["swing_friction"])
         fitted = (base.build_regressor(motion) @ truth).reshape(-1, 3) if settings["linear"] else force
         value = base.estimate(motion, fitted)
@@ -132,7 +132,7 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     }
     values |= {f"unrealistic.{m}": float(np.mean(part)) for m, part in unrealistic.items()}
     values["unrealistic"] = float(np.mean(np.concatenate(list(unrealistic.values()))))
-    values |= _find_unexplained_fraction(motion)
+    values |= _compute_unexplained_force_fraction(motion)
     return Sample(values, _draw_panels(motion, judged, measured, predicted))
 
 
@@ -148,22 +148,24 @@ def _simulate_records(
         files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
     fit, heldout, _ = build_records(make_dataset(files, load_machine("cat215"), "ideal", HELD_OUT_SCENARIO))
     rows = FIT_ROWS // len(FIT_SCENARIOS)
-    return [_select_rows(record, rows) for record in fit], [_select_rows(heldout, HELD_OUT_ROWS)]
+    return [_skip_start_and_select_rows(record, rows) for record in fit], [
+        _skip_start_and_select_rows(heldout, HELD_OUT_ROWS)
+    ]
 
 
-def _select_rows(record: IdentificationRecord, rows: int) -> IdentificationRecord:
+def _skip_start_and_select_rows(record: IdentificationRecord, rows: int) -> IdentificationRecord:
     chosen = slice(_SKIPPED_ROWS, _SKIPPED_ROWS + rows)
     return replace(record, position=record.position[chosen], force=record.force[chosen])
 
 
-def _add_errors(
+def _add_sensor_errors(
     record: IdentificationRecord, settings: Mapping[str, Any], rng: np.random.Generator
 ) -> IdentificationRecord:
     """Return a record with uniform random errors of joint angles and cylinder pressures added."""
     machine, shape = load_machine("cat215"), record.position.shape
     angle = np.deg2rad(settings["angle_error_deg"])
     pressure = _PSI * settings["pressure_error_psi"]
-    areas = np.array([machine.axes[axis].hydraulic_drive.areas for axis in record.axes])
+    areas = np.array([machine.axes[axis].hydraulic_drive.effective_areas for axis in record.axes])
     force = record.force + areas[:, 0] * rng.uniform(-pressure, pressure, shape)
     force -= areas[:, 1] * rng.uniform(-pressure, pressure, shape)
     uniform = 1.0 / np.sqrt(3.0)  # standard deviation of a uniform error of limit 1
@@ -176,7 +178,7 @@ def _add_errors(
 
 def _differentiate_record(record: IdentificationRecord) -> Motion:
     """Compute positions, rates and accelerations of a record with the optimal smoother (p. 112)."""
-    found = smooth(record.position, record.period, record.position_noise)
+    found = smooth_and_differentiate(record.position, record.period, record.position_noise)
     return found.value, found.rate, found.acceleration
 
 
@@ -203,9 +205,9 @@ def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.nd
     return base.truth + np.array([dry.get(name, 0.0) for name in base.names])
 
 
-def _find_unexplained_fraction(motion: Motion) -> dict[str, float]:
+def _compute_unexplained_force_fraction(motion: Motion) -> dict[str, float]:
     """Return the RMS fraction of the forces due to the cylinders' inertia that the reduced model cannot fit."""
-    complete, reduced = find_base("complete"), find_base("reduced")
+    complete, reduced = find_base_parameters("complete"), find_base_parameters("reduced")
     table = make_regressor(complete.setup, motion)
     bars = [name.endswith(("_tube", "_rod")) and "coulomb" not in name for name in table.names]
     force = (table.matrix @ np.where(bars, table.nominal, 0.0)).ravel()
@@ -242,7 +244,7 @@ def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, ac
     """Return a check of the ratio of two models' RMS force errors of drive k over all repetitions."""
     drive = DRIVES[k]
     rows = np.array([[s.values[f"{m}.{drive}"] for m in (one, other)] for s in samples])
-    return check_statistic(
+    return check_bootstrapped_statistic(
         f"RMS error of {one} over {other} model, {drive}", rows,
         lambda r: float(np.sqrt(np.mean(r[:, 0] ** 2) / np.mean(r[:, 1] ** 2))), accepted, reason,
         published=PUBLISHED_RMS[one][k] / PUBLISHED_RMS[other][k],
@@ -309,7 +311,7 @@ def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
     )
 
 
-def evaluate_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_errors_against_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Check that the force errors of the complete model are almost within the accuracy of the sensors.
 
     The limit is the largest published ratio that the document calls almost within.
@@ -392,7 +394,7 @@ PREDICTION = Experiment(
             '"the errors in the estimated torques/forces of the complete model are almost within'
             ' the accuracy of the sensors"; 3720 N m, 5860 N, 8700 N against +-1400 N m, +-5700 N,'
             " +-4200 N",
-            "pp. 108 and 117", "document", evaluate_sensor_accuracy,
+            "pp. 108 and 117", "document", evaluate_errors_against_sensor_accuracy,
             fault={"friction_identified": False},
             fault_description="the identified model has no friction", panel_labels=(),
         ),

@@ -5,17 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample, merge_settings
-from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic
+from hydrotele.experiments.intervals import check_bootstrapped_statistic, check_deterministic_value, check_mean
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
     SAMPLE_PERIOD,
     UNITS,
     Motion,
-    draw_motion,
-    find_base,
+    find_base_parameters,
     make_regressor,
+    sample_motion,
 )
-from hydrotele.identify.smoothing import smooth
+from hydrotele.identify.smoothing import smooth_and_differentiate
 from hydrotele.machine.machine_file import load_machine
 
 SENSOR_ACCURACY = (1400.0, 5700.0, 4200.0)
@@ -31,7 +31,7 @@ ANGLE_ACCURACY = np.deg2rad(0.1)
 """Largest error of a resolver [rad] (p. 107)."""
 
 
-def measure_errors(seed: int, changes: Changes) -> Sample:
+def measure_parameter_errors(seed: int, changes: Changes) -> Sample:
     """Compute parameter errors for pressure sensors of 25 psi, of 5 psi, and without errors.
 
     Uniform errors are added to the simulated angles and forces. Rates and accelerations are exact,
@@ -47,12 +47,12 @@ def measure_errors(seed: int, changes: Changes) -> Sample:
     """
     settings = merge_settings(NOISE_SETTINGS, changes)
     rng = np.random.default_rng(seed)
-    motion = draw_motion(rng)
+    motion = sample_motion(rng)
     rows = len(motion[0])
     angles = ANGLE_ACCURACY * rng.uniform(-1.0, 1.0, (2, rows, 3))
     forces = np.array(SENSOR_ACCURACY) * rng.uniform(-1.0, 1.0, (2, rows, 3))
     scale, rest, gain = (settings[k] for k in ("noise", "residual_noise", "pressure_gain"))
-    derived = smooth(motion[0] + scale * angles[0], SAMPLE_PERIOD, ANGLE_ACCURACY / np.sqrt(3.0))
+    derived = smooth_and_differentiate(motion[0] + scale * angles[0], SAMPLE_PERIOD, ANGLE_ACCURACY / np.sqrt(3.0))
     five = scale / gain
     # (measured motion, case -> (factor of the force errors, index of their random sample))
     plans = (
@@ -66,7 +66,7 @@ def measure_errors(seed: int, changes: Changes) -> Sample:
     arrays = {}
     for model in ("complete", "reduced"):
         known = model == "complete" and settings["cylinders_known"]
-        base = find_base("reduced" if known else model)
+        base = find_base_parameters("reduced" if known else model)
         table = make_regressor(base.setup, motion)
         exact = table.matrix @ table.nominal
         for measured, cases in plans:
@@ -81,12 +81,12 @@ def _add_angle_errors(motion: Motion, errors: np.ndarray) -> Motion:
     return motion[0] + errors, motion[1], motion[2]
 
 
-def _collect_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
+def _stack_parameter_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
     """Return the (n, p) parameter errors of n repetitions for one model and case."""
     return np.array([sample.arrays[name] for sample in samples])
 
 
-def _compute_mean_ratio(rows: np.ndarray) -> float:
+def _compute_median_error_ratio(rows: np.ndarray) -> float:
     """Return the median over parameters of the ratio of two errors, averaged geometrically over repetitions.
 
     Args:
@@ -100,11 +100,11 @@ def _find_improved_fraction(samples: Sequence[Sample], model: str, better: str) 
     """Return the (n,) fraction of parameters whose error decreases by a factor of 10 to 100.
 
     Args:
-        samples: n samples of `measure_errors`.
+        samples: n samples of `measure_parameter_errors`.
         model: `complete` or `reduced`.
         better: case that is compared with sensors of 25 psi.
     """
-    ratio = _collect_errors(samples, f"{model}.25 psi") / _collect_errors(samples, f"{model}.{better}")
+    ratio = _stack_parameter_errors(samples, f"{model}.25 psi") / _stack_parameter_errors(samples, f"{model}.{better}")
     return np.mean((ratio >= 10.0) & (ratio <= 100.0), axis=1)
 
 
@@ -116,9 +116,9 @@ def _make_improvement_evaluation(model: str, note_suffix: str = ""):
         note_suffix: text appended to the note.
     """
 
-    def judge(samples: Sequence[Sample]) -> Evaluation:
+    def evaluate_improvement(samples: Sequence[Sample]) -> Evaluation:
         pairs = {
-            name: np.stack([_collect_errors(samples, f"{model}.{k}") for k in names], axis=1)
+            name: np.stack([_stack_parameter_errors(samples, f"{model}.{k}") for k in names], axis=1)
             for name, names in (
                 ("", ("25 psi", "5 psi")),
                 ("pressures", ("pressures 25 psi", "pressures 5 psi")),
@@ -128,12 +128,12 @@ def _make_improvement_evaluation(model: str, note_suffix: str = ""):
         reason = '"10 to 100 times"'
         independent = _find_improved_fraction(samples, model, "independent")
         checks = (
-            check_statistic("error with 25 psi over error with 5 psi, median of the parameters",
-                            pairs[""], _compute_mean_ratio, (10.0, 100.0), reason),
+            check_bootstrapped_statistic("error with 25 psi over error with 5 psi, median of the parameters",
+                            pairs[""], _compute_median_error_ratio, (10.0, 100.0), reason),
             check_mean("fraction of parameters whose error decreases 10 to 100 times in one run"
                        " with independent errors", independent, (0.5, 1.0), "most parameters"),
         )  # fmt: skip
-        only, smoothed = (_compute_mean_ratio(pairs[k]) for k in ("pressures", "differentiated"))
+        only, smoothed = (_compute_median_error_ratio(pairs[k]) for k in ("pressures", "differentiated"))
         return Evaluation(
             checks,
             "The estimate is linear in the forces: five times smaller pressure errors give five"
@@ -146,7 +146,7 @@ def _make_improvement_evaluation(model: str, note_suffix: str = ""):
             f" {100 * np.mean(independent > 0.5):.0f} %{note_suffix}",
         )
 
-    return judge
+    return evaluate_improvement
 
 
 def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
@@ -154,14 +154,14 @@ def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
 
     An error above half of the parameter's size is large.
     """
-    errors = _collect_errors(samples, "complete.25 psi")
+    errors = _stack_parameter_errors(samples, "complete.25 psi")
     check = check_mean(
         "fraction of base parameters of the complete model with errors above half of their"
         " size", np.mean(errors > 0.5, axis=1), (0.8, 1.0),
         "almost all: four of five; an error above half of the size is large",
     )  # fmt: skip
     medians = ", ".join(
-        f"{m} {np.median(_collect_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
+        f"{m} {np.median(_stack_parameter_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
     )
     return Evaluation((check,), note=f"median error over size: {medians}")
 
@@ -169,9 +169,9 @@ def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
     """Check that sensor readings without errors give the true parameters to three digits."""
     checks = tuple(
-        check_statistic(
+        check_bootstrapped_statistic(
             f"largest error over size of the {model} model, median of the runs",
-            _collect_errors(samples, f"{model}.none"), lambda r: float(np.median(r.max(axis=1))),
+            _stack_parameter_errors(samples, f"{model}.none"), lambda r: float(np.median(r.max(axis=1))),
             (0.0, 5e-4), "three digits are printed",
         )
         for model in ("complete", "reduced")
@@ -179,22 +179,22 @@ def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(checks)
 
 
-def evaluate_reduced_errors(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_reduced_model_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that parameters common to both models have at most half the error in the reduced model."""
-    names = [find_base(model).names for model in ("complete", "reduced")]
+    names = [find_base_parameters(model).names for model in ("complete", "reduced")]
     if samples[0].arrays["complete.none"].size == len(names[1]):
         names[0] = names[1]
     shared = [name for name in names[1] if name in names[0]]
     rows = np.stack(
         [
-            _collect_errors(samples, f"{model}.25 psi")[:, [own.index(name) for name in shared]]
+            _stack_parameter_errors(samples, f"{model}.25 psi")[:, [own.index(name) for name in shared]]
             for model, own in zip(("complete", "reduced"), names, strict=True)
         ],
         axis=1,
     )
-    check = check_statistic(
+    check = check_bootstrapped_statistic(
         f"error in the complete over error in the reduced model, median of {len(shared)} common"
-        " parameters", rows, _compute_mean_ratio, (2.0, np.inf), "much less: at most half",
+        " parameters", rows, _compute_median_error_ratio, (2.0, np.inf), "much less: at most half",
     )  # fmt: skip
     return Evaluation((check,))
 
@@ -205,7 +205,7 @@ _TABLE_15_NOTE = (
 )
 
 SENSOR_NOISE_EXPERIMENT = Experiment(
-    "sensor accuracy", measure_errors,
+    "sensor accuracy", measure_parameter_errors,
     (
         Claim(
             "large errors of the complete model",
@@ -239,7 +239,7 @@ SENSOR_NOISE_EXPERIMENT = Experiment(
             "reduced model identified more accurately",
             '"the error in the individual parameters of the reduced model is much less than that of'
             ' the corresponding parameters for the complete model."',
-            "Tables 14 and 15, p. 110", "document", evaluate_reduced_errors,
+            "Tables 14 and 15, p. 110", "document", evaluate_reduced_model_errors,
             fault={"cylinders_known": True}, fault_description="cylinders of the complete model known",
         ),
     ),
@@ -251,18 +251,18 @@ SENSOR_NOISE_EXPERIMENT = Experiment(
 ACCURACY_SETTINGS = {"accuracy_psi": 25.0}
 
 
-def measure_accuracy(seed: int, changes: Changes) -> Sample:
+def compute_force_accuracy(seed: int, changes: Changes) -> Sample:
     """Compute each drive's largest force error from the pressure error times the sum of both piston areas."""
     pressure = 6894.757 * merge_settings(ACCURACY_SETTINGS, changes)["accuracy_psi"]
     machine = load_machine("cat215")
-    return Sample({d: pressure * float(np.sum(machine.axes[d].hydraulic_drive.areas)) for d in DRIVES})
+    return Sample({d: pressure * float(np.sum(machine.axes[d].hydraulic_drive.effective_areas)) for d in DRIVES})
 
 
-def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_force_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Check that the largest force errors of the drives round to the printed ones (Khoshzaban 1992, p. 108)."""
     return Evaluation(
         tuple(
-            check_exact(f"largest error, {drive}", samples[0].values[drive],
+            check_deterministic_value(f"largest error, {drive}", samples[0].values[drive],
                         (limit - 50.0, 1.001 * (limit + 50.0)), unit=unit, published=limit,
                         reason="printed to hundreds, with a pound-force that is 0.1 % too small")
             for drive, limit, unit in zip(DRIVES, SENSOR_ACCURACY, UNITS, strict=True)
@@ -271,11 +271,11 @@ def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
 
 
 FORCE_ACCURACY = Experiment(
-    "accuracy of forces", measure_accuracy,
+    "accuracy of forces", compute_force_accuracy,
     (
         Claim(
             "accuracy of forces", "cabin: +-1400 N m, boom: +-5700 N, stick: +-4200 N",
-            "Eqs 4.33 and 4.61, p. 108", "input", evaluate_accuracy,
+            "Eqs 4.33 and 4.61, p. 108", "input", evaluate_force_accuracy,
             fault={"accuracy_psi": 5.0}, fault_description="sensors of 5 psi",
         ),
     ),

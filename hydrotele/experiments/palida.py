@@ -136,7 +136,7 @@ class Robot:
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
 
 
-def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw 100 random poses, rates and accelerations, each (100, 6), that excite all parameters.
 
     The seed is fixed.
@@ -153,7 +153,7 @@ def load_robot() -> Robot:
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
     setup = mechanism.setup
-    table = setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *draw_states()))
+    table = setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *sample_states()))
     rows = table.matrix.reshape(-1, len(table.names))
     structure = classify_parameters(rows, table.names, table.units, [one.column for one in PUBLISHED_PARAMETERS])
     names = [table.names[b] for b in structure.base]
@@ -234,7 +234,7 @@ def simulate_excitation() -> RepeatedMotion:
     return simulate_motion(motion.evaluate(time), motion.period)
 
 
-def draw_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+def sample_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Draw random force noise (*shape, 6) of the drives [N] with covariance `compute_force_covariance`."""
     return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(compute_force_covariance()).T
 
@@ -258,7 +258,7 @@ def simulate_measurement(
     """
     n = len(cycle.length) * periods
     error = length_noise * rng.standard_normal((n, 6))
-    noise = draw_force_noise((n,), rng)
+    noise = sample_force_noise((n,), rng)
     noise -= feedback_gains[0] * error
     noise -= feedback_gains[1] * np.gradient(error, 1.0 / SAMPLE_RATE, axis=0)
     drives = load_robot().setup.chain.drives
@@ -297,7 +297,7 @@ def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.nda
     r = np.clip(time / _ACCELERATION_TIME, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
     faded = _ACCELERATION_TIME * (2.5 * r**4 - 3.0 * r**5 + r**6)
     angle = turn * (faded + np.maximum(time - _ACCELERATION_TIME, 0.0))
-    return _differentiate(radius * np.cos(angle), radius * np.sin(angle))
+    return _build_planar_motion(radius * np.cos(angle), radius * np.sin(angle))
 
 
 def plan_square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
@@ -321,10 +321,10 @@ def plan_square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarr
     s = place - at
     share = (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)[:, None]
     path = corner[at % 4] + share * (corner[(at + 1) % 4] - corner[at % 4])
-    return _differentiate(path[:, 0], path[:, 1])
+    return _build_planar_motion(path[:, 0], path[:, 1])
 
 
-def _differentiate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _build_planar_motion(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     pose = np.tile(HOME_POSE, (len(x), 1))
     pose[:, 0] += x
     pose[:, 1] += y
@@ -376,7 +376,7 @@ def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0
     data.qpos[chain.qpos_indices[here]] = q[0, here]
     place = model.joint("platform").qposadr[0]
     data.qpos[place : place + 3] = motion[0, 0, :3]
-    data.qpos[place + 3 : place + 7] = _convert_to_quaternion(motion[0, 0, 3:])
+    data.qpos[place + 3 : place + 7] = _convert_cardan_to_quaternion(motion[0, 0, 3:])
     stiff, damp = compute_control_gains()
     held = own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
     if feedforward is not None:
@@ -388,7 +388,7 @@ def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0
     for row in range(len(reference)):
         true = data.qpos[slides]
         error[row] = reference[row] - true
-        pose_error[row] = motion[0, row] - _convert_to_pose(data.qpos[place : place + 7])
+        pose_error[row] = motion[0, row] - _convert_qpos_to_pose(data.qpos[place : place + 7])
         reading = true + LENGTH_NOISE * rng.standard_normal(6)
         if last is not None:  # first-order low-pass at 100 Hz of the differences
             speed += (1.0 - np.exp(-2.0 * np.pi * 100.0 / SAMPLE_RATE)) * (
@@ -402,7 +402,7 @@ def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0
     return TrackingErrors(time, error, pose_error, int(sum(w.number for w in data.warning)))
 
 
-def _convert_to_quaternion(angles: np.ndarray) -> np.ndarray:
+def _convert_cardan_to_quaternion(angles: np.ndarray) -> np.ndarray:
     out, one = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
     for axis, angle in zip(np.eye(3), angles, strict=True):
         mujoco.mju_axisAngle2Quat(one, axis, angle)
@@ -410,7 +410,7 @@ def _convert_to_quaternion(angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def _convert_to_pose(qpos: np.ndarray) -> np.ndarray:
+def _convert_qpos_to_pose(qpos: np.ndarray) -> np.ndarray:
     turn = np.empty(9)
     mujoco.mju_quat2Mat(turn, qpos[3:])
     return np.concatenate([qpos[:3], cardan_angles(turn.reshape(3, 3))])

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
-from hydrotele.experiments.intervals import check_exact, collect_values
+from hydrotele.experiments.intervals import check_deterministic_value, collect_values
 from hydrotele.experiments.palida import (
     LEGS,
     PUBLISHED_PARAMETERS,
     SYMBOLS,
-    draw_states,
     load_robot,
+    sample_states,
 )
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.multibody.chain import Chain
@@ -47,7 +47,7 @@ class Relation(NamedTuple):
     weights: dict[str, float]
 
 
-def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def compute_inertial_transformation(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """Return the matrix that transforms a body's inertial parameters to its parent's frame.
 
     Args:
@@ -57,7 +57,7 @@ def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
     Returns:
         (10, 10) matrix L of (9), with rows and columns in the order of `BODY_PARAMETERS`.
 
-    >>> unit = transfer_parameters(np.eye(3), np.array([0.0, 0.0, 2.0]))
+    >>> unit = compute_inertial_transformation(np.eye(3), np.array([0.0, 0.0, 2.0]))
     >>> dict(zip(_KINDS, unit[:, 0].tolist()))["inertia_xx"]  # Steiner: 1 kg at a distance of 2 m
     4.0
     """
@@ -80,7 +80,7 @@ def _build_inertia_tensor(entries: np.ndarray) -> np.ndarray:
     return tensor + np.triu(tensor, 1).T
 
 
-def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relation]:
+def list_regrouping_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relation]:
     """List the relations between the parameters of the 19 bodies by the rules of section 2.1.
 
     Prismatic joint: all moments of inertia of the slider are added to the stator. Platform: the
@@ -102,24 +102,24 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
     for leg in LEGS:
         ring, stator, slider = (f"{kind}_{leg}" for kind in ("ring", "stator", "slider"))
         body = chain.bodies.index(slider) + 1
-        turned = transfer_parameters(tree.rotation[body], np.zeros(3))
+        turned = compute_inertial_transformation(tree.rotation[body], np.zeros(3))
         for kind in _INERTIAS:
-            yield Relation(f"{kind}.{slider}", _name_weights(turned, kind, stator))
+            yield Relation(f"{kind}.{slider}", _list_parent_weights(turned, kind, stator))
         if platform_rule:
-            joint = transfer_parameters(np.eye(3), tree.closure_points[leg - 1, 1])
-            yield Relation(f"mass.{slider}", _name_weights(joint, "mass", "platform"))
+            joint = compute_inertial_transformation(np.eye(3), tree.closure_points[leg - 1, 1])
+            yield Relation(f"mass.{slider}", _list_parent_weights(joint, "mass", "platform"))
         body = chain.bodies.index(stator) + 1
-        moved = transfer_parameters(tree.rotation[body], tree.offset[body])
+        moved = compute_inertial_transformation(tree.rotation[body], tree.offset[body])
         for kind in ("mass", "moment_z"):
-            yield Relation(f"{kind}.{stator}", _name_weights(moved, kind, ring))
-        rod = _name_weights(moved, "inertia_xx", ring, "inertia_yy")
+            yield Relation(f"{kind}.{stator}", _list_parent_weights(moved, kind, ring))
+        rod = _list_parent_weights(moved, "inertia_xx", ring, "inertia_yy")
         yield Relation(f"inertia_yy.{stator}", rod | {f"inertia_xx.{stator}": -1.0})
         for kind in ("mass", "moment_z", *_INERTIAS):
             if kind != "inertia_zz":
                 yield Relation(f"{kind}.{ring}", {})
 
 
-def _name_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
+def _list_parent_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
     """Return the coefficients by which parameters of the parent body replace a body's parameter, or a sum.
 
     Args:
@@ -152,7 +152,7 @@ def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> n
     return regrouped
 
 
-def list_table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
+def list_printed_combinations(joints: np.ndarray) -> dict[str, dict[str, float]]:
     """Return the ten combinations of Abdellatif 2008, Table 1, with parameter names of the model's first leg.
 
     Args:
@@ -191,7 +191,7 @@ in Table 1.
 """
 
 
-def measure_structure(seed: int, changes: Changes) -> Sample:
+def compare_base_parameter_methods(seed: int, changes: Changes) -> Sample:
     """Find the base parameters by printed table, regrouping rules and null space, and compare the results.
 
     Args:
@@ -208,17 +208,17 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
     own = load_robot()
     chain, found = (
         own.setup.chain,
-        project_on_drives(own.setup.chain, own.setup.given_joints, *draw_states()),
+        project_on_drives(own.setup.chain, own.setup.given_joints, *sample_states()),
     )
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in _KINDS]
-    regrouped = regroup_parameters(bodies, list_relations(chain, settings["platform_rule"]))
+    regrouped = regroup_parameters(bodies, list_regrouping_relations(chain, settings["platform_rule"]))
     values: dict[str, float] = {}
     spectra = []
     for stage, options in _BODY_ASSUMPTIONS.items():
         table = replace(own.setup, **options).compute_regressor(found)
-        structure, kept = _reduce_inertial(table)
+        structure, kept = _find_inertial_base_parameters(table)
         names = [table.names[k] for k in kept]
-        sums = _build_sum_matrix(bodies, names, own.setup.equal_groups if stage != "19 bodies" else ())
+        sums = _build_shared_parameter_matrix(bodies, names, own.setup.equal_groups if stage != "19 bodies" else ())
         rules = (regrouped @ sums)[[bodies.index(name) for name in names]]  # one of equal legs
         rules = rules[np.any(rules, axis=1)]
         values[f"columns, {stage}"] = len(kept)
@@ -226,7 +226,7 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
         values[f"rules, {stage}"] = len(rules)
         values[f"difference, {stage}"] = _find_largest_difference(rules, structure)
         spectra.append(_compute_singular_values(table.matrix[:, :, kept]))
-    printed = list_table_1(settings["joint_radius"] * chain.tree.closure_points[:, 1])
+    printed = list_printed_combinations(settings["joint_radius"] * chain.tree.closure_points[:, 1])
     structure = own.base_parameters
     if not settings["declare_symmetry"]:
         table = replace(own.setup, zero_parameters=()).compute_regressor(found)
@@ -256,7 +256,7 @@ def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
     return np.maximum(values / values[0], np.finfo(float).eps / 2)
 
 
-def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
+def _find_inertial_base_parameters(table: Regressor) -> tuple[Identifiability, list[int]]:
     """Find the base parameters of the inertial columns; return them and the columns' indices."""
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
@@ -265,7 +265,9 @@ def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
     return classify_parameters(rows, names, units, [name for name in first if name in names]), kept
 
 
-def _build_sum_matrix(bodies: Sequence[str], names: Sequence[str], equal_bodies: Sequence[Sequence[str]]) -> np.ndarray:
+def _build_shared_parameter_matrix(
+    bodies: Sequence[str], names: Sequence[str], equal_bodies: Sequence[Sequence[str]]
+) -> np.ndarray:
     """Return the matrix (190, m) that copies m distinct parameters to all bodies with equal parameters."""
     first = {body: group[0] for group in equal_bodies for body in group}
     sums = np.zeros((len(bodies), len(names)))
@@ -313,11 +315,11 @@ def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation(
         (
-            check_exact("rigid-body base parameters", values["rigid"], (10, 10), "Table 1",
+            check_deterministic_value("rigid-body base parameters", values["rigid"], (10, 10), "Table 1",
                         published=10),
-            check_exact("friction parameters", values["friction"], (14, 14), "Table 1",
+            check_deterministic_value("friction parameters", values["friction"], (14, 14), "Table 1",
                         published=14),
-            check_exact("combinations with the members and coefficients of Table 1", values["same"],
+            check_deterministic_value("combinations with the members and coefficients of Table 1", values["same"],
                         (10, 10), "Table 1", published=10),
         ),
         "the null space is computed from a regressor with equal legs and 19 inertial columns"
@@ -332,9 +334,9 @@ def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
     for stage in _BODY_ASSUMPTIONS:
         rank = values[f"rank, {stage}"]
         checks += [
-            check_exact(f"base parameters by the rules, {stage}", values[f"rules, {stage}"],
+            check_deterministic_value(f"base parameters by the rules, {stage}", values[f"rules, {stage}"],
                         (rank, rank), f"rank of {values[f'columns, {stage}']:.0f} columns"),
-            check_exact(f"largest difference of coefficients, {stage}",
+            check_deterministic_value(f"largest difference of coefficients, {stage}",
                         values[f"difference, {stage}"], (0.0, MAX_ROUNDING), "rounding"),
         ]  # fmt: skip
     return Evaluation(tuple(checks))
@@ -343,14 +345,14 @@ def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_parameter_values(samples: Sequence[Sample]) -> Evaluation:
     """Check that the model's base parameters equal the estimates of Abdellatif 2008, Table 2."""
     worst = float(collect_values(samples, "values").max())
-    check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
+    check = check_deterministic_value("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip
     return Evaluation((check,))
 
 
 STRUCTURE = Experiment(
     "base parameters",
-    measure_structure,
+    compare_base_parameter_methods,
     (
         Claim(
             "base parameters",

@@ -8,7 +8,7 @@ from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
 
 
-def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
+def run_shipped_scenario(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
     """Simulate a scenario that is shipped with the package, with changed settings.
 
     Args:
@@ -41,7 +41,7 @@ def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
             "attitude": np.sum(bends, axis=0)}  # fmt: skip
 
 
-def make_operator_changes(seed: int) -> dict[str, str]:
+def make_random_operator_settings(seed: int) -> dict[str, str]:
     """Return scenario settings that draw a random operator of the published population and set the seed.
 
     Args:

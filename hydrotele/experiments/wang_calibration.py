@@ -20,9 +20,9 @@ from hydrotele.experiments.comparison import (
     merge_settings,
 )
 from hydrotele.experiments.intervals import (
+    check_bootstrapped_statistic,
     check_fraction,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
@@ -32,7 +32,7 @@ from hydrotele.experiments.wang_robots import (
     SENSOR_NOISE,
     SimulatedRobot,
     compute_rms,
-    compute_test_errors,
+    compute_test_pose_errors,
     make_caption_claim,
     simulate_robot,
 )
@@ -66,7 +66,7 @@ def _check_accuracy(quantity: str, samples: Sequence[Sample], name: str):
                       ACCURACY_REASON, unit="mm")  # fmt: skip
 
 
-def _describe_change(samples: Sequence[Sample], name: str, unit: str = "mm") -> str:
+def _describe_before_and_after(samples: Sequence[Sample], name: str, unit: str = "mm") -> str:
     return (
         f"{format_values(samples, f'{name} before', 1e3, 2)} {unit} before,"
         f" {format_values(samples, f'{name} after', 1e3, 3)} {unit} after calibration"
@@ -98,13 +98,13 @@ def measure_refined_model(seed: int, changes: Changes) -> Sample:
     low, high = done.fit.intervals.T
     exact = simulate_robot(1000 + seed, 25, noise=settings["exact_noise"])
     recovered = calibrate_hybrid_robot(nominal, exact.measurement, "dh", names).fit
-    before = compute_test_errors(simulated, nominal)[0]
-    after = compute_test_errors(simulated, done.robot)[0]
+    before = compute_test_pose_errors(simulated, nominal)[0]
+    after = compute_test_pose_errors(simulated, done.robot)[0]
     complete = calibrate_hybrid_robot(nominal, measurement, "dh").robot
     return Sample(
         {"position before": compute_rms(before), "position after": compute_rms(after),
          "largest": float(after.max()),
-         "with 54": compute_rms(compute_test_errors(simulated, complete)[0]),
+         "with 54": compute_rms(compute_test_pose_errors(simulated, complete)[0]),
          "inside": float(np.mean((truth > low) & (truth < high))),
          "exact": float(np.abs(
              recovered.values - exact.errors[exact.model.parameter_indices(recovered.names)]).max())},
@@ -115,7 +115,7 @@ def measure_refined_model(seed: int, changes: Changes) -> Sample:
 def _evaluate_redundancy(samples: Sequence[Sample]) -> Evaluation:
     pairs = np.array([(s.values["with 54"], s.values["position after"]) for s in samples])
     return Evaluation(
-        (check_statistic("RMS error at test poses with the 54 parameters over that with the 36",
+        (check_bootstrapped_statistic("RMS error at test poses with the 54 parameters over that with the 36",
                          pairs, lambda rows: float(np.sqrt(
                              np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
                          (1.0, np.inf), '"deteriorate"'),),
@@ -161,9 +161,9 @@ def measure_poe_model(seed: int, changes: Changes) -> Sample:
     nominal = load_hybrid("iwr")
     simulated = simulate_robot(900 + seed, 25, "poe", refined_only=False, noise=settings["noise"])
     done = calibrate_hybrid_robot(nominal, simulated.measurement, "poe")
-    test = compute_test_errors(simulated, done.robot)[0]
+    test = compute_test_pose_errors(simulated, done.robot)[0]
     truth, found = simulated.errors, done.parameter_errors
-    count = simulated.model.carriage_count
+    count = simulated.model.carriage_parameter_count
     values = {
         "rank": done.redundancy.rank,
         "position before": compute_rms(done.nominal_errors.position),
@@ -186,17 +186,17 @@ def _evaluate_poe_model(samples: Sequence[Sample]) -> Evaluation:
                     "all: complete and minimal"),
          _check_accuracy("RMS position error at 25 test poses", samples, "test")),
         "The sensor noise is an assumption; errors are proportional to it.",
-        f"RMS at the measured poses {_describe_change(samples, 'position')}",
+        f"RMS at the measured poses {_describe_before_and_after(samples, 'position')}",
     )  # fmt: skip
 
 
-def _describe_part(part: str):
-    def describe(samples: Sequence[Sample]) -> str:
+def _make_part_description(part: str):
+    def describe_part_errors(samples: Sequence[Sample]) -> str:
         return (f"RMS of the assumed errors {format_values(samples, f'assumed {part}', 1e3, 2)}, of"
                 f" identified minus assumed {format_values(samples, f'missed {part}', 1e3, 2)}"
                 " (mm or mrad)")  # fmt: skip
 
-    return describe
+    return describe_part_errors
 
 
 def _describe_axes(samples: Sequence[Sample]) -> str:
@@ -224,8 +224,8 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
     done = calibrate_hybrid_robot(nominal, m, "dh")
     legs = [np.abs(leg_readings(robot, m.joints, m.pose) - m.legs).max(axis=1)
             for robot in (nominal, done.robot)]  # fmt: skip
-    test = compute_test_errors(simulated, done.robot)[0]
-    reached = [_reach_desired_poses(simulated, robot) for robot in (nominal, done.robot)]
+    test = compute_test_pose_errors(simulated, done.robot)[0]
+    reached = [_compute_reached_position_errors(simulated, robot) for robot in (nominal, done.robot)]
     truth, found = simulated.errors, done.parameter_errors
     values = {
         "leg before": float(legs[0].max()),
@@ -255,7 +255,7 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
     return Sample(values, panels)
 
 
-def _reach_desired_poses(simulated: SimulatedRobot, robot: HybridRobot) -> np.ndarray:
+def _compute_reached_position_errors(simulated: SimulatedRobot, robot: HybridRobot) -> np.ndarray:
     """Return the position errors of the true robot when a model's inverse kinematics commands it.
 
     Args:
@@ -280,7 +280,7 @@ def _evaluate_whole_robot(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def _evaluate_correction(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_controller_correction(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (_check_accuracy("RMS error of the reached position", samples, "reached after"),),
         "The sensor noise is an assumption; errors are proportional to it.",
@@ -289,16 +289,16 @@ def _evaluate_correction(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def _describe_range(name: str, words: str):
-    def describe(samples: Sequence[Sample]) -> str:
+def _make_range_description(name: str, words: str):
+    def describe_range(samples: Sequence[Sample]) -> str:
         low, high = (format_values(samples[:1], f"{end} {name}", digits=2)
                      for end in ("least", "most"))  # fmt: skip
         return f"{words} {low} to {high} (m or rad), first robot"
 
-    return describe
+    return describe_range
 
 
-def measure_wire_method(seed: int, changes: Changes) -> Sample:
+def measure_wire_pose_errors(seed: int, changes: Changes) -> Sample:
     """Measure the errors of platform poses that are computed from exact and from noisy wire lengths.
 
     Args:
@@ -357,12 +357,12 @@ def _describe_wire_points(samples: Sequence[Sample]) -> str:
 
 
 WIRE_POSES = Experiment(
-    "3-2-1 wires", measure_wire_method,
+    "3-2-1 wires", measure_wire_pose_errors,
     (
         make_caption_claim(
             "poses and carriage displacements", "Table 2 (p. 43)",
             '"Randomly generated end-effector poses and carriage-joint displacements (unit: mm for'
-            ' lengths and rad. for angles)"', _describe_range("joints", "carriage joints from"),
+            ' lengths and rad. for angles)"', _make_range_description("joints", "carriage joints from"),
         ),
         Claim(
             "3-2-1 wires: pose by three spheres",
@@ -437,17 +437,17 @@ POE_MODEL = Experiment(
                       '"Kinematic parameters in the reference configuration"', _describe_axes),
         make_caption_claim(
             "POE model: carriage", "Table 7 (p. 57)",
-            '"Nominal and identified parameters of carriage"', _describe_part("carriage"),
+            '"Nominal and identified parameters of carriage"', _make_part_description("carriage"),
         ),
         make_caption_claim("POE model: hexapod", "Table 8 (p. 57)",
                       '"Nominal and identified parameters of the Hexa-WH (unit: mm)"',
-                      _describe_part("hexapod")),
+                      _make_part_description("hexapod")),
         make_caption_claim(
             "POE model: 25 poses before and after", "Table 9, Figs 20 and 21 (p. 60, 61)",
             '"Results of 25 end-effector poses before and after calibration"; "Position errors'
             ' before calibration in the 25 end-effector pose configurations."; "Position errors'
             ' after calibration in the 25 end-effector pose configurations."',
-            lambda samples: f"position RMS {_describe_change(samples, 'position')}",
+            lambda samples: f"position RMS {_describe_before_and_after(samples, 'position')}",
             lambda samples: (samples[0].panels, None),
         ),
     ),
@@ -468,12 +468,12 @@ WIRE_CALIBRATION = Experiment(
             "correction in the controller",
             '"to compensate them in the robot controller so as to make the error model match the'
             ' real robot as closely as possible"; "high accuracy (±0.1 mm) for the assembly robot"',
-            "section 1.1 (p. 20, 19)", "document", _evaluate_correction, {"noise": 10.0},
+            "section 1.1 (p. 20, 19)", "document", _evaluate_controller_correction, {"noise": 10.0},
             "ten times the sensor noise", panel_labels=("error of the reached position [mm]",),
         ),
         make_caption_claim("actuated-joint displacements", "Table 11 (p. 69)",
                       '"Measured actuated-joint displacements in the Solidworks environment"',
-                      _describe_range("legs", "legs from")),
+                      _make_range_description("legs", "legs from")),
         make_caption_claim(
             "identified parameters of the hybrid robot", "Table 13 (p. 72)",
             '"Nominal and identified parameters of the hybrid IWR robot (unit: mm)"',
@@ -486,21 +486,21 @@ WIRE_CALIBRATION = Experiment(
             "legs before and after calibration", "Table 14, Figs 25 and 26 (p. 73, 74)",
             '"Leg errors before calibration in 20 pose configurations."; "Leg errors after'
             ' calibration in 20 pose configurations."',
-            lambda samples: f"largest leg error {_describe_change(samples, 'leg')}",
+            lambda samples: f"largest leg error {_describe_before_and_after(samples, 'leg')}",
             lambda samples: (samples[0].panels[:1], None),
         ),
         make_caption_claim(
             "orientation before and after calibration", "Table 15, Figs 27 and 28 (p. 75, 76)",
             '"Orientation errors before calibration in 20 pose configurations."; "Orientaion errors'
             ' after calibration in 20 pose configurations."',
-            lambda samples: f"RMS {_describe_change(samples, 'orientation', 'mrad')}",
+            lambda samples: f"RMS {_describe_before_and_after(samples, 'orientation', 'mrad')}",
             lambda samples: (samples[0].panels[1:2], None),
         ),
         make_caption_claim(
             "position before and after calibration", "Table 15, Figs 29 and 30 (p. 75, 77)",
             '"Position errors before calibration in 20 pose configurations."; "Position errors'
             ' after calibration in 20 pose configurations"',
-            lambda samples: f"RMS {_describe_change(samples, 'position')}",
+            lambda samples: f"RMS {_describe_before_and_after(samples, 'position')}",
             lambda samples: (samples[0].panels[2:3], None),
         ),
     ),

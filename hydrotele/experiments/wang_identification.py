@@ -9,7 +9,7 @@ from hydrotele.calibrate.hybrid import (
     build_equations,
     calibrate_hybrid_robot,
     find_redundancy,
-    fitted_equations,
+    restrict_to_fitted_parameters,
 )
 from hydrotele.calibrate.posterior import Posterior, minimize_by_evolution, sample_posterior
 from hydrotele.experiments.comparison import (
@@ -24,15 +24,15 @@ from hydrotele.experiments.comparison import (
     merge_settings,
 )
 from hydrotele.experiments.intervals import (
+    check_bootstrapped_statistic,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
 from hydrotele.experiments.wang_robots import (
     Drawing,
     compute_rms,
-    compute_test_errors,
+    compute_test_pose_errors,
     make_caption_claim,
     measure_nominal_robot,
     simulate_robot,
@@ -74,12 +74,12 @@ The available text does not define the dd of Fig. 14; d4 is used instead.
 """
 
 
-def _select_samples(posterior: Posterior) -> np.ndarray:
+def _downsample_posterior(posterior: Posterior) -> np.ndarray:
     flat = posterior.flat_sample
     return flat[:: max(1, len(flat) // MAX_PLOTTED_SAMPLES)]
 
 
-def measure_redundancy(seed: int, changes: Changes) -> Sample:
+def compare_posterior_with_null_space(seed: int, changes: Changes) -> Sample:
     """Compare the sampled posterior of the 54 parameters with the null space of the Jacobian by QR.
 
     The prior is normal with the standard deviations of the manufacturing errors. Along a parameter
@@ -127,18 +127,18 @@ def measure_redundancy(seed: int, changes: Changes) -> Sample:
         values[f"mean {name}"] = 1e3 * float(posterior.mean[at[name]])
         values[f"deviation {name}"] = 1e3 * float(posterior.standard_deviations[at[name]])
         values[f"assumed {name}"] = 1e3 * float(simulated.errors[at[name]])
-    arrays = {"draws": 1e3 * _select_samples(posterior), "truth": 1e3 * simulated.errors,
+    arrays = {"draws": 1e3 * _downsample_posterior(posterior), "truth": 1e3 * simulated.errors,
               "names": np.array(names)}  # fmt: skip
     return Sample(values, (), arrays)
 
 
-def _draw_posterior(names: tuple[str, ...]) -> Drawing:
-    def draw(samples: Sequence[Sample]):
+def _make_posterior_drawing(names: tuple[str, ...]) -> Drawing:
+    def draw_marginals(samples: Sequence[Sample]):
         arrays = samples[0].arrays
         at = [list(arrays["names"]).index(name) for name in names]
         return (), Marginals(names, arrays["draws"][:, at], arrays["truth"][at])
 
-    return draw
+    return draw_marginals
 
 
 def _check_rhat(samples: Sequence[Sample]) -> Check:
@@ -146,7 +146,7 @@ def _check_rhat(samples: Sequence[Sample]) -> Check:
                       (1.0, MAX_RHAT), "converged chains, Gelman et al. 11.4")  # fmt: skip
 
 
-def _evaluate_redundancy(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_posterior_redundancy(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_mean("posterior over prior standard deviation along the redundant directions of QR",
                     collect_values(samples, "posterior over prior"), (0.9, 1.1),
@@ -161,24 +161,24 @@ def _evaluate_redundancy(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def _describe_correlation(figure: int, names: tuple[str, ...]):
-    def describe(samples: Sequence[Sample]) -> str:
+def _make_correlation_description(figure: int, names: tuple[str, ...]):
+    def describe_correlation(samples: Sequence[Sample]) -> str:
         parts = [f"{name} {format_values(samples, f'{figure} {name}', digits=2)}"
                  for name in names[1:]]  # fmt: skip
         return f"posterior correlation of {names[0]} with {', '.join(parts)}"
 
-    return describe
+    return describe_correlation
 
 
-def _describe_estimates(names: tuple[str, ...]):
-    def describe(samples: Sequence[Sample]) -> str:
+def _make_estimate_description(names: tuple[str, ...]):
+    def describe_estimates(samples: Sequence[Sample]) -> str:
         first = samples[0].values
         parts = [f"{name} assumed {first[f'assumed {name}']:.2f}, identified"
                  f" {first[f'mean {name}']:.2f} ± {first[f'deviation {name}']:.2f}"
                  for name in names]  # fmt: skip
         return f"{'; '.join(parts)} (mm or mrad, first robot)"
 
-    return describe
+    return describe_estimates
 
 
 REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
@@ -200,7 +200,7 @@ def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
     simulated = simulate_robot(500 + seed, 25)
     names = refined_model_parameters(simulated.model)
     done = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, "dh", names)
-    eq, fit = fitted_equations(done), done.fit
+    eq, fit = restrict_to_fitted_parameters(done), done.fit
     weight = settings["chain_noise"] ** -2
     posterior = sample_posterior(
         lambda x: -weight * eq.negative_log_likelihood(x), fit.values, fit.covariance, eq.names,
@@ -220,7 +220,7 @@ def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
         values[f"deviation {name}"] = 1e3 * float(posterior.standard_deviations[at])
         values[f"assumed {name}"] = 1e3 * float(truth[at])
     arrays = {
-        "draws": 1e3 * _select_samples(posterior),
+        "draws": 1e3 * _downsample_posterior(posterior),
         "truth": 1e3 * truth,
         "names": np.array(names),
     }
@@ -241,7 +241,7 @@ def _evaluate_refined_posterior(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def measure_rank(seed: int, changes: Changes) -> Sample:
+def count_independent_parameters(seed: int, changes: Changes) -> Sample:
     """Count the independent parameters of the error models, and calibrate 36 or all parameters of a robot.
 
     All 54 parameters of the robot have errors.
@@ -271,7 +271,7 @@ def measure_rank(seed: int, changes: Changes) -> Sample:
     for label, chosen in (("36", names), ("54", None)):
         robot = calibrate_hybrid_robot(nominal, simulated.measurement, "dh", chosen).robot
         values[f"error with {label}"] = compute_rms(
-            compute_test_errors(simulated, robot)[0])  # fmt: skip
+            compute_test_pose_errors(simulated, robot)[0])  # fmt: skip
     panel = Panel(
         "singular value over the largest [1]", np.arange(1, 55),
         {"Jacobian of 54 parameters, columns of length 1": np.maximum(singular, 1e-16)},
@@ -280,8 +280,8 @@ def measure_rank(seed: int, changes: Changes) -> Sample:
     return Sample(values, (panel,))
 
 
-def _evaluate_rank(samples: Sequence[Sample]) -> Evaluation:
-    def number(name: str) -> str:
+def _evaluate_independent_parameters(samples: Sequence[Sample]) -> Evaluation:
+    def format_count(name: str) -> str:
         return format_values(samples, name, digits=0)
 
     return Evaluation(
@@ -290,22 +290,22 @@ def _evaluate_rank(samples: Sequence[Sample]) -> Evaluation:
                     published=36.0),),
         f"Four parameters are redundant: theta4, d4, a4 and alpha4 have the same effect as a"
         f" common displacement of A1 to A6. Only without tilt of the platform A_i and B_i"
-        f" cannot be distinguished; then the rank is {number('rank dh without tilt')} (D-H) or"
-        f" {number('rank poe without tilt')} (POE). 36 parameters cannot describe a robot with"
+        f" cannot be distinguished; then the rank is {format_count('rank dh without tilt')} (D-H) or"
+        f" {format_count('rank poe without tilt')} (POE). 36 parameters cannot describe a robot with"
         f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)}"
         f" mm at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
         " independent ones.",
-        f"{number('told')} are determined to better than 0.5 mm or 0.5 mrad with this noise; the 36"
-        f" have rank {number('rank of 36')}",
+        f"{format_count('told')} are determined to better than 0.5 mm or 0.5 mrad with this noise; the 36"
+        f" have rank {format_count('rank of 36')}",
     )  # fmt: skip
 
 
-def _measure_evolution(seed: int, changes: Changes, kind: ErrorModelKind, poses: int) -> Sample:
+def _identify_by_differential_evolution(seed: int, changes: Changes, kind: ErrorModelKind, poses: int) -> Sample:
     settings = merge_settings({"generations": 20000}, changes)
     simulated = simulate_robot(seed, poses, kind)
     names = refined_model_parameters(simulated.model)
     done = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, simulated.model.kind, names)
-    eq = fitted_equations(done)
+    eq = restrict_to_fitted_parameters(done)
     box = SEARCH_HALF_WIDTH * eq.scales
     found = minimize_by_evolution(
         eq.negative_log_likelihood,
@@ -324,23 +324,23 @@ def _measure_evolution(seed: int, changes: Changes, kind: ErrorModelKind, poses:
     )  # fmt: skip
 
 
-def measure_evolution_dh(seed: int, changes: Changes) -> Sample:
+def identify_dh_by_differential_evolution(seed: int, changes: Changes) -> Sample:
     """Identify the 36 parameters of the D-H model by differential evolution from 15 poses."""
-    return _measure_evolution(100 + seed, changes, "dh", 15)
+    return _identify_by_differential_evolution(100 + seed, changes, "dh", 15)
 
 
-def measure_evolution_poe(seed: int, changes: Changes) -> Sample:
+def identify_poe_by_differential_evolution(seed: int, changes: Changes) -> Sample:
     """Identify 36 parameters of the POE model by differential evolution from 25 poses."""
-    return _measure_evolution(200 + seed, changes, "poe", 25)
+    return _identify_by_differential_evolution(200 + seed, changes, "poe", 25)
 
 
-def _evaluate_evolution(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_differential_evolution(samples: Sequence[Sample]) -> Evaluation:
     effort = np.array([(s.values["evaluations"], s.values["least squares"]) for s in samples])
     return Evaluation(
         (check_mean("excess of DE's negative log likelihood over that of least squares",
                     collect_values(samples, "excess"), (-np.inf, MAX_LIKELIHOOD_EXCESS),
                     "one standard deviation of one parameter"),
-         check_statistic("evaluations of the model by DE over those by least squares", effort,
+         check_bootstrapped_statistic("evaluations of the model by DE over those by least squares", effort,
                          lambda rows: float(np.sum(rows[:, 0]) / np.sum(rows[:, 1])),
                          (1.0, np.inf), '"less computation time" of the linearization, p. 25')),
         note=f"DE starts within {SEARCH_HALF_WIDTH:g} standard deviations of the errors and stops"
@@ -348,15 +348,15 @@ def _evaluate_evolution(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def _describe_evolution(samples: Sequence[Sample]) -> str:
+def _describe_differential_evolution(samples: Sequence[Sample]) -> str:
     return (
         f"cost above the optimum {format_values(samples, 'excess', digits=3)} in units of log"
         f" likelihood after {format_values(samples, 'generations', digits=0)} generations"
     )
 
 
-def _draw_evolution(count: int) -> Drawing:
-    def draw(samples: Sequence[Sample]):
+def _make_cost_history_drawing(count: int) -> Drawing:
+    def draw_cost_history(samples: Sequence[Sample]):
         histories = [sample.arrays["history"] for sample in samples[:count]]
         longest = max(map(len, histories))
         curves = {f"data set {k}": np.pad(history, (0, longest - len(history)), mode="edge")
@@ -365,42 +365,42 @@ def _draw_evolution(count: int) -> Drawing:
                       curves, "generation [1]", log=True)  # fmt: skip
         return (panel,), None
 
-    return draw
+    return draw_cost_history
 
 
 EVOLUTION_DH = Experiment(
-    "D-H model by DE", measure_evolution_dh,
+    "D-H model by DE", identify_dh_by_differential_evolution,
     (
         Claim(
             "DE does not depend on initial values",
             '"whether the initial values are close to the optimum solution or not is'
             ' insignificant"; iterative linearization has "less computation time to converge"',
-            "section 2.2 (p. 25, 26)", "document", _evaluate_evolution, {"generations": 200},
+            "section 2.2 (p. 25, 26)", "document", _evaluate_differential_evolution, {"generations": 200},
             "DE is stopped after 200 generations",
         ),
         make_caption_claim(
             "DE on four data sets", "Fig. 10 (p. 45)",
             '"Simulation results of four different data sets."',
-            lambda samples: _describe_evolution(samples[:4]), _draw_evolution(4),
+            lambda samples: _describe_differential_evolution(samples[:4]), _make_cost_history_drawing(4),
         ),
         make_caption_claim(
             "DE on five data sets of 15 poses", "Fig. 11 (p. 46)",
             '"Simulation results of 15 measurement poses in five different data sets."',
-            _describe_evolution, _draw_evolution(5),
+            _describe_differential_evolution, _make_cost_history_drawing(5),
         ),
     ),
     fixed_repetitions=5,
 )  # fmt: skip
 
 REDUNDANCY = Experiment(
-    "54 parameters by MCMC", measure_redundancy,
+    "54 parameters by MCMC", compare_posterior_with_null_space,
     (
         Claim(
             "redundancy by MCMC and by QR",
             '"the MCMC method has also been used to analyze parameter redundancy and parameter'
             ' identifiability of the hybrid error model"; "the identifiable parameters are'
             ' calculated from QR decomposition of the analytical observation matrix"',
-            "section 2.2 (p. 26), section 2.1 (p. 23)", "document", _evaluate_redundancy,
+            "section 2.2 (p. 26), section 2.1 (p. 23)", "document", _evaluate_posterior_redundancy,
             {"tilt_of_jacobian": 0.0}, "QR analyses poses without tilt, MCMC those with tilt",
             panel_labels=(),
         ),
@@ -408,20 +408,20 @@ REDUNDANCY = Experiment(
             "54 parameters, without measurement noise", "Table 3 (p. 47)",
             '"Nominal values, assumed errors, identified posterior mean values, and standard'
             ' deviations for the 54-parameter model (without measurement noise)"',
-            _describe_estimates(("a4", "theta4", "a1x")),
+            _make_estimate_description(("a4", "theta4", "a1x")),
         ),
         *(make_caption_claim(
             f"posterior of Fig. {figure}", f"Fig. {figure} (p. {page})",
             '"2D marginal posterior distributions and 1D marginal density for parameters'
             f' {words}."',
-            _describe_correlation(figure, names), _draw_posterior(names),
+            _make_correlation_description(figure, names), _make_posterior_drawing(names),
         ) for figure, (page, names, words) in FIGURE_CAPTIONS.items()),
     ),
     max_repetitions=3,
 )  # fmt: skip
 
 RANK_EXPERIMENT = Experiment(
-    "independent parameters", measure_rank,
+    "independent parameters", count_independent_parameters,
     (
         Claim(
             "54 parameters are refined to 36",
@@ -429,7 +429,7 @@ RANK_EXPERIMENT = Experiment(
             ' model must contain only a minimal number of parameters and the redundant parameters'
             ' have to be eliminated"', 
             "titles of Tables 3 to 5 (p. 47, 53, 54), section 2.1 (p. 24)", "document",
-            _evaluate_rank, {"tilt": 0.0}, "the platform never tilts",
+            _evaluate_independent_parameters, {"tilt": 0.0}, "the platform never tilts",
         ),
     ),
     max_repetitions=10,
@@ -449,24 +449,24 @@ REFINED_POSTERIOR = Experiment(
             "36 parameters, with measurement noise", "Table 5 (p. 54)",
             '"Nominal values, assumed errors, identified posterior mean values, and standard'
             ' deviations for the refined 36-parameter model (with measurement noise)"',
-            _describe_estimates(REFINED_NAMES),
+            _make_estimate_description(REFINED_NAMES),
         ),
         make_caption_claim(
             "posterior of Fig. 18", "Fig. 18 (p. 55)",
             '"2D marginal posterior distributions and 1D marginal density for parameters δa4, δθ4,'
-            ' δb1x, δb6z."', _describe_estimates(REFINED_NAMES), _draw_posterior(REFINED_NAMES),
+            ' δb1x, δb6z."', _make_estimate_description(REFINED_NAMES), _make_posterior_drawing(REFINED_NAMES),
         ),
     ),
     max_repetitions=3,
 )  # fmt: skip
 
 EVOLUTION_POE = Experiment(
-    "POE model by DE", measure_evolution_poe,
+    "POE model by DE", identify_poe_by_differential_evolution,
     (
         make_caption_claim(
             "fitness of DE, POE model", "Fig. 19 (p. 59)",
             '"Fitness values of four different runs with four different measurement data sets."',
-            _describe_evolution, _draw_evolution(4),
+            _describe_differential_evolution, _make_cost_history_drawing(4),
         ),
     ),
     fixed_repetitions=4,

@@ -25,21 +25,21 @@ from hydrotele.experiments.comparison import (
     merge_settings,
 )
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_mean,
-    check_statistic,
     format_values,
 )
 from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY
 from hydrotele.kinematics.hybrid import (
     PlatformPose,
-    apply_errors,
+    apply_geometry_errors,
     build_error_model,
     build_hybrid,
     carriage_pose,
     first_order_carriage_pose,
-    forward_by_evolution,
     forward_kinematics,
+    forward_kinematics_by_evolution,
     leg_readings,
     load_hybrid,
     pose_difference,
@@ -54,7 +54,7 @@ from hydrotele.simulate.hybrid import (
 MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above rounding errors
 
 
-def measure_kinematics(seed: int, changes: Changes) -> Sample:
+def compare_carriage_kinematics(seed: int, changes: Changes) -> Sample:
     """Compare the carriage's D-H matrices with the printed position, Wang 2012, Eq. 7.
 
     The parameter errors of carriage and hexapod are counted as well.
@@ -83,23 +83,23 @@ def measure_kinematics(seed: int, changes: Changes) -> Sample:
     model = build_error_model(robot, "dh")
     difference = np.abs(carriage_pose(robot, joints)[:, :3, 3] - printed).max()
     return Sample({
-        "difference": float(difference), "carriage": model.carriage_count,
-        "hexapod": len(model.names) - model.carriage_count,
+        "difference": float(difference), "carriage": model.carriage_parameter_count,
+        "hexapod": len(model.names) - model.carriage_parameter_count,
     })  # fmt: skip
 
 
-def _evaluate_carriage(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_carriage_kinematics(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
-        (check_exact("largest difference of a coordinate", samples[0].values["difference"],
+        (check_deterministic_value("largest difference of a coordinate", samples[0].values["difference"],
                      (0.0, MAX_ROUNDING), "rounding", unit="m"),),
         note="200 random poses; minus signs, missing in the available text, follow from Table 1",
     )  # fmt: skip
 
 
-def _evaluate_model_size(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_parameter_error_counts(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation(tuple(
-        check_exact(f"parameter errors of the {part}", values[part], (float(count), float(count)),
+        check_deterministic_value(f"parameter errors of the {part}", values[part], (float(count), float(count)),
                     "as printed", published=count)
         for part, count in (("carriage", 12), ("hexapod", 42))
     ))  # fmt: skip
@@ -110,7 +110,7 @@ _SLIDE: JointKind = "prismatic"
 _BALL: JointKind = "spherical"
 
 
-def build_hybrid_robot(straight: bool) -> Mechanism:
+def build_iwr_mechanism(straight: bool) -> Mechanism:
     """Build the robot IWR: a measured PPRR carriage in series with a hexapod of six S-P-S legs.
 
     P, R and S are prismatic, revolute and spherical joints.
@@ -130,7 +130,7 @@ MECHANISMS = {
         "6-UPS", (*_TWO_HINGES, _SLIDE, _BALL)),
     "6-RRPRRR hexapod": hexapod_mechanism("6-RRPRRR", (*_TWO_HINGES, _SLIDE, *_TWO_HINGES, "revolute")),
     "Delta robot": delta_mechanism(),
-    "IWR with 6-SPS hexapod": build_hybrid_robot(straight=False),
+    "IWR with 6-SPS hexapod": build_iwr_mechanism(straight=False),
 }  # fmt: skip
 """Mechanisms with loops and arbitrary dimensions, for which Eq. 5 is evaluated."""
 
@@ -156,39 +156,39 @@ def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
     """
     settings = merge_settings({"locked_joints": 0, "poses": 30}, changes)
 
-    def rank(mechanism: Mechanism) -> int:
+    def compute_identifiable_rank(mechanism: Mechanism) -> int:
         measured = [name for name, joint in mechanism.joints.items() if joint.measured]
         locked = frozenset(measured[: settings["locked_joints"]])
         return identifiable_rank(mechanism, np.random.default_rng(seed), settings["poses"], fixed_joints=locked)
 
-    values: dict[str, float] = {"hexapod": rank(STRAIGHT_HEXAPOD)}
-    values["robot"] = rank(build_hybrid_robot(straight=True))
+    values: dict[str, float] = {"hexapod": compute_identifiable_rank(STRAIGHT_HEXAPOD)}
+    values["robot"] = compute_identifiable_rank(build_iwr_mechanism(straight=True))
     for name, kinds in _SERIAL_ROBOTS.items():
-        values[f"rank {name}"] = rank(serial_mechanism(name, kinds))
+        values[f"rank {name}"] = compute_identifiable_rank(serial_mechanism(name, kinds))
         values[f"count {name}"] = count_serial_parameters(kinds.count("revolute"), kinds.count("prismatic"))
     for name, mechanism in MECHANISMS.items():
-        values[f"rank {name}"] = rank(mechanism)
+        values[f"rank {name}"] = compute_identifiable_rank(mechanism)
         values[f"count {name}"] = mechanism.count_parameters()
     return Sample(values)
 
 
 def _make_count_evaluation(names: Sequence[str], note: str):
-    def judge(samples: Sequence[Sample]) -> Evaluation:
+    def evaluate_counts(samples: Sequence[Sample]) -> Evaluation:
         values = samples[0].values
         return Evaluation(tuple(
-            check_exact(f"independent parameters of the {name}", values[f"rank {name}"],
+            check_deterministic_value(f"independent parameters of the {name}", values[f"rank {name}"],
                         (values[f"count {name}"], values[f"count {name}"]), "the formula",
                         published=values[f"count {name}"])
             for name in names
         ), note=note)  # fmt: skip
 
-    return judge
+    return evaluate_counts
 
 
 def _evaluate_hexapod(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation(
-        (check_exact("independent parameters", values["hexapod"], (42, 42),
+        (check_deterministic_value("independent parameters", values["hexapod"], (42, 42),
                      "as many as the error model has: complete and minimal, page 23",
                      published=42),),
         note=f"Eq. 5 counts {MECHANISMS['6-SPS hexapod'].count_parameters()}, with one additional"
@@ -223,8 +223,8 @@ def measure_first_order(seed: int, changes: Changes) -> Sample:
         ("structure", larger, errors, stretched),
     ):  # fmt: skip
         model = build_error_model(robot, "dh")
-        true = carriage_pose(apply_errors(model, planted), at)[:, :3, 3]
-        linear = first_order_carriage_pose(robot, planted[: model.carriage_count], at)[:, :3, 3]
+        true = carriage_pose(apply_geometry_errors(model, planted), at)[:, :3, 3]
+        linear = first_order_carriage_pose(robot, planted[: model.carriage_parameter_count], at)[:, :3, 3]
         unchanged = carriage_pose(robot, at)[:, :3, 3]
         values[f"omitted {name}"] = float(np.linalg.norm(linear - true, axis=1).max())
         values[f"moved {name}"] = float(np.linalg.norm(unchanged - true, axis=1).max())
@@ -246,7 +246,7 @@ def _evaluate_error_growth(samples: Sequence[Sample]) -> Evaluation:
     checks = []
     for name, words in (("errors", "errors"), ("structure", "lengths and travels")):
         pairs = np.array([(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples])
-        checks.append(check_statistic(
+        checks.append(check_bootstrapped_statistic(
             f"second-order error with doubled {words} over the usual one", pairs,
             lambda rows: float(np.sqrt(np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
             (1.0, np.inf), "increases",
@@ -322,7 +322,7 @@ def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
     joints, legs = sample_poses(robot, 1, rng)
     pose = forward_kinematics(robot, joints, legs)
     newton = PlatformPose(pose.rotation[0], pose.position[0])
-    evolved = forward_by_evolution(robot, joints[0], legs[0], seed=seed, reach=settings["reach"])
+    evolved = forward_kinematics_by_evolution(robot, joints[0], legs[0], seed=seed, reach=settings["reach"])
     model = build_hybrid_mechanism(robot).compile()
     closed = solve_mechanism_pose(model, mujoco.MjData(model), robot, joints[0], legs[0])
     return Sample({
@@ -346,19 +346,19 @@ def _evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
 
 
 KINEMATICS = Experiment(
-    "kinematics of the carriage", measure_kinematics,
+    "kinematics of the carriage", compare_carriage_kinematics,
     (
         Claim(
             "carriage: forward kinematics",
             "The product of the four D-H matrices of Table 1 is Eq. 7; its last column is (d3 + a4"
             " s4, d2 + a3 s3 + a4 s3 c4, d1 + a3 c3 + a4 c3 c4).",
-            "Table 1, Eq. 7 (p. 29)", "input", _evaluate_carriage, {"third_twist": -0.5 * np.pi},
+            "Table 1, Eq. 7 (p. 29)", "input", _evaluate_carriage_kinematics, {"third_twist": -0.5 * np.pi},
             "the third link is twisted by -90 instead of 90 deg",
         ),
         Claim(
             "size of the error model",
             '"the number of parameter errors for the serial part is 12"; "the number of parameter'
-            ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _evaluate_model_size,
+            ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _evaluate_parameter_error_counts,
             {"second_joint": "revolute"}, "the second joint is a hinge",
         ),
     ),

@@ -24,7 +24,7 @@ from hydrotele.kinematics.hybrid import (
     ErrorModel,
     ErrorModelKind,
     HybridRobot,
-    apply_errors,
+    apply_geometry_errors,
     build_error_model,
     forward_kinematics,
     load_hybrid,
@@ -87,7 +87,7 @@ def simulate_robot(
     rng, wires, nominal = np.random.default_rng([_SEED, seed]), default_wires(), load_hybrid("iwr")
     model = build_error_model(nominal, kind)
     errors = sample_manufacturing_errors(model, rng, refined_model_parameters(model) if refined_only else None)
-    robot = apply_errors(model, errors)
+    robot = apply_geometry_errors(model, errors)
     sizes = {name: noise * size for name, size in SENSOR_NOISE.items()}
     commands = sample_poses(nominal, poses, rng, wires)
     read = simulate_measured_poses(robot, *commands, wires, sizes, rng)
@@ -115,7 +115,7 @@ def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) ->
     return measurement_from_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "exact")
 
 
-def compute_test_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
+def compute_test_pose_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose errors of a calibrated model at the M held-out poses of a simulated robot.
 
     Args:
@@ -132,7 +132,7 @@ def compute_test_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[
     return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
 
 
-def count_covered_errors(seed: int) -> tuple[int, int]:
+def count_errors_within_intervals(seed: int) -> tuple[int, int]:
     """Count how many true parameter errors lie within the 95 % intervals of a least-squares calibration.
 
     Args:

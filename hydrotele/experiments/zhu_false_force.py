@@ -17,13 +17,13 @@ from hydrotele.control.endpoint_force import GravityModel, endpoint_force_of_log
 from hydrotele.effects.effect import with_value
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
 from hydrotele.experiments.intervals import check_mean, collect_values, format_values
-from hydrotele.experiments.scenario_runs import make_operator_changes, run_shipped
+from hydrotele.experiments.scenario_runs import make_random_operator_settings, run_shipped_scenario
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_with_friction_shapes
 from hydrotele.identify.identified_machine import build_identified_machine
 from hydrotele.identify.motion import Processing
 from hydrotele.identify.record import build_records
-from hydrotele.identify.setup import cylinder_bars, machine_setup
+from hydrotele.identify.setup import machine_setup, map_cylinder_bodies
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine import Machine
@@ -48,7 +48,7 @@ def _perturb_machine(machine: Machine) -> Machine:
 
 
 @cache
-def identify_models(seed_offset: int) -> tuple[Machine, GravityModel]:
+def identify_feller_models(seed_offset: int) -> tuple[Machine, GravityModel]:
     """Identify the feller-buncher's dynamic and static model from logs of simulated sensors.
 
     Args:
@@ -57,20 +57,20 @@ def identify_models(seed_offset: int) -> tuple[Machine, GravityModel]:
     Returns:
         (machine of the dynamic estimate, parameters of the static estimate).
     """
-    _, slow = run_shipped("feller_slow_moves", {"seed": str(10 + seed_offset)})
+    _, slow = run_shipped_scenario("feller_slow_moves", {"seed": str(10 + seed_offset)})
     start = _perturb_machine(slow.plant.machine)
     gravity = identify_gravity(start, slow.measured)
     with tempfile.TemporaryDirectory() as folder:
         for number, seed in enumerate(_LOG_SEEDS):
             period = "30.0" if number == 0 else "26.0"
             keys = {"seed": str(seed + seed_offset), "pilot.period": period}
-            _, run = run_shipped("feller_excitation", keys)
+            _, run = run_shipped_scenario("feller_excitation", keys)
             save_log(run.measured, Path(folder, f"log_{number}.parquet"))
         data = load_dataset(Path(folder), start, _SENSOR_SET, "log_1", force=True)
     fit, validation, notes = build_records(data)
     setup = machine_setup(start, load_closed_chain(start), "complete")
     found = identify_with_friction_shapes(fit, validation, setup, Processing(), Estimator(), notes=notes)
-    machine, _ = build_identified_machine(start, found, cylinder_bars(start))
+    machine, _ = build_identified_machine(start, found, map_cylinder_bodies(start))
     return machine, gravity
 
 
@@ -86,7 +86,7 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
     Returns:
         RMS false forces of both models [N] and their ratios.
     """
-    machine, gravity = identify_models(0)
+    machine, gravity = identify_feller_models(0)
     values, panels = {}, []
     squares = {"static": 0.0, "dynamic": 0.0}
     at_rest = np.nan
@@ -94,9 +94,9 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
         if name == "feller_joint_steps":
             keys = {"seed": str(seed)} | dict(changes)
         else:  # this scenario has another pilot, to which changes of the first do not apply
-            keys = make_operator_changes(seed)
+            keys = make_random_operator_settings(seed)
             keys |= {k: v for k, v in changes.items() if not k.startswith("pilot")}
-        _, run = run_shipped(name, keys)
+        _, run = run_shipped_scenario(name, keys)
         time = run.measured.time
         sensors = machine.sensors.get(_SENSOR_SET)
         curves = {}

@@ -13,9 +13,9 @@ from hydrotele.experiments.intervals import (
 )
 from hydrotele.experiments.scenario_runs import (
     compute_cylindrical_pose,
-    make_operator_changes,
+    make_random_operator_settings,
     read_true_channel,
-    run_shipped,
+    run_shipped_scenario,
 )
 from hydrotele.run.run import Run
 from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
@@ -32,7 +32,7 @@ _MIN_SWING_ANGLE = 30.0  # swing angle to the side [deg]
 _EVENT_WORDS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
 
 
-def measure_felling(seed: int, changes: Changes) -> Sample:
+def simulate_tree_felling(seed: int, changes: Changes) -> Sample:
     """Simulate felling a tree: contact of the head with the stem, sawing, grabbing and laying down.
 
     `touched` is the time of the first contact of 0.5 kN or more between head and stem; contact with
@@ -46,7 +46,7 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
         Event times [s], contact forces [N], joystick stiffness [N/m], and attitude and swing angle of
         the head when it lets go of the stem [deg].
     """
-    scenario, run = run_shipped("fell_tree", make_operator_changes(seed) | dict(changes))
+    scenario, run = run_shipped_scenario("fell_tree", make_random_operator_settings(seed) | dict(changes))
     pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
     contact = {thing: _compute_contact_force(run, thing) for thing in ("tree_0", "tree_0_stump")}
     values = {
@@ -142,7 +142,7 @@ def _evaluate_felt_stiffness(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation((check,), explanation, note)
 
 
-def _evaluate_process(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_felling_sequence(samples: Sequence[Sample]) -> Evaluation:
     touched, saw, cut, held, let_go, laid, aside, tripped = (
         collect_values(samples, key) for key in ("touched", "saw", "cut", "held", "let_go", "laid", "aside", "tripped")
     )
@@ -183,7 +183,7 @@ def _compute_tipping_fraction(run: Run, facts: TipOver) -> np.ndarray:
     return np.array([tipping_ratio(facts, r, f) for r, f in pairs])
 
 
-def measure_pushing(seed: int, changes: Changes) -> Sample:
+def simulate_pushing_down(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who pushes the feller-buncher's head down with constant hand force.
 
     The run is repeated without force reflection, on softer ground, and with a stiff hand that keeps its
@@ -204,8 +204,8 @@ def measure_pushing(seed: int, changes: Changes) -> Sample:
     }
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = make_operator_changes(seed) | keys | dict(changes)
-        _, run = run_shipped("press_over", keys)
+        keys = make_random_operator_settings(seed) | keys | dict(changes)
+        _, run = run_shipped_scenario("press_over", keys)
         share, m = _compute_tipping_fraction(run, _FELLER_TIP_OVER), run.measured
         touching = run.truth.time[np.argmax(share > 0.02)] if (share > 0.02).any() else 0.0
         late = m.time > run.scenario.duration - 5.0
@@ -254,7 +254,7 @@ def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(checks, explanation)
 
 
-def measure_protection(seed: int, changes: Changes) -> Sample:
+def simulate_tip_over_protection(seed: int, changes: Changes) -> Sample:
     """Simulate pressing with a target force of 60 kN, with and without the added tip-over spring.
 
     Without this spring in the joystick, the force tips the machine.
@@ -269,7 +269,9 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
     values, panels = {}, []
     too_large = {"pilot.operator.target.force": "[6.0e+4]"}
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
-        scenario, run = run_shipped("tip_over", make_operator_changes(seed) | too_large | keys | dict(changes))
+        scenario, run = run_shipped_scenario(
+            "tip_over", make_random_operator_settings(seed) | too_large | keys | dict(changes)
+        )
         assert isinstance(scenario.pilot, TeleopPilot)
         facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, tipping_edge=1.6)
         share, handle = _compute_tipping_fraction(run, facts), run.measured["handle.z"]
@@ -299,7 +301,7 @@ def _evaluate_protection(samples: Sequence[Sample]) -> Evaluation:
 
 
 TIP_OVER = (
-    Experiment("constant hand force", measure_pushing, (
+    Experiment("constant hand force", simulate_pushing_down, (
         Claim(
             "tip-over: the stick pushed back",
             '"the most effective way is via force reflection which automatically pushes the'
@@ -321,7 +323,7 @@ TIP_OVER = (
             "no reflection in both",
         ),
     ), 6),
-    Experiment("added spring", measure_protection, (
+    Experiment("added spring", simulate_tip_over_protection, (
         Claim(
             "tip-over: an added spring",
             "an additional spring of 8 kN/m beyond half of the tipping moment prevents an operator"
@@ -336,7 +338,7 @@ TIP_OVER = (
 )  # fmt: skip
 
 FELLING = (
-    Experiment("tree", measure_felling, (
+    Experiment("tree", simulate_tree_felling, (
         Claim(
             "a tree felled: contact",
             '"The endpoint force increased rapidly after contact with the tree was made"',
@@ -362,7 +364,7 @@ FELLING = (
             ' closed and grabbed it. The cut tree was then laid to the side in bunches"',
             "p. 105",
             "document",
-            _evaluate_process,
+            _evaluate_felling_sequence,
             {"pilot.buttons": "[{start: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),

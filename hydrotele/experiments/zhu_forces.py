@@ -15,17 +15,17 @@ import yaml
 from hydrotele.core.files import models_folder
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
 from hydrotele.experiments.scenario_runs import (
-    make_operator_changes,
+    make_random_operator_settings,
     read_true_channel,
-    run_shipped,
+    run_shipped_scenario,
 )
 from hydrotele.experiments.zhu_felling import JUST_NOTICEABLE_DIFFERENCE
 from hydrotele.run.run import Run
@@ -47,7 +47,7 @@ _PUBLISHED_HAND_FORCE = 4.5  # hand force [N], p. 96
 _PUBLISHED_FORCE_RATIO = _PUBLISHED_HAND_FORCE / _TARGET_FORCE
 
 
-def find_task(scenario: Scenario) -> RegulateForce | TrackForce:
+def find_force_task(scenario: Scenario) -> RegulateForce | TrackForce:
     """Return the force task of a scenario's operator model, which contains the target force over time."""
     assert isinstance(scenario.pilot, TeleopPilot)
     behaviour = scenario.pilot.operator
@@ -56,7 +56,7 @@ def find_task(scenario: Scenario) -> RegulateForce | TrackForce:
 
 
 def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, ...]:
-    time, facts, m = run.truth.time, find_task(scenario).target, run.measured
+    time, facts, m = run.truth.time, find_force_task(scenario).target, run.measured
     target = np.interp(time, facts.time, facts.force) / 1e3
     force = read_true_channel(run, "truth.contact_force.z") / 1e3
     estimated = np.interp(time, m.time, m["tip_force.z"]) / 1e3
@@ -68,7 +68,7 @@ def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, 
     )  # fmt: skip
 
 
-def _compute_line_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
+def _compute_proportionality_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
     """Return the RMS deviation of a force from slope times displacement, over the RMS force [1]."""
     return float(np.sqrt(np.mean((force - slope * x) ** 2) / np.mean(force**2)))
 
@@ -86,10 +86,10 @@ def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
         Held forces [N], errors relative to the targets, and deviations of the hand force from
         proportionality to the handle's displacement.
     """
-    keys = make_operator_changes(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)
-    scenario, run = run_shipped("press_stiffness", keys)
+    keys = make_random_operator_settings(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)
+    scenario, run = run_shipped_scenario("press_stiffness", keys)
     m, values = run.measured, {}
-    facts = find_task(scenario).target
+    facts = find_force_task(scenario).target
     edges = [*facts.time[2::2], scenario.duration]
     error, true_error, line, fixed_line = 0.0, 0.0, 0.0, 0.0
     force = read_true_channel(run, "truth.contact_force.z")
@@ -103,8 +103,8 @@ def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
         true_error = max(true_error, abs(true / goal - 1.0))
         pressing = (m.time > start + 1.0) & (m.time <= edge)
         x, hand = m["handle.z"][pressing], m["hand_force.z"][pressing]
-        line = max(line, _compute_line_error(x, hand, m["handle_stiffness.z"][pressing]))
-        fixed_line = max(fixed_line, _compute_line_error(x, hand, float((x @ hand) / (x @ x))))
+        line = max(line, _compute_proportionality_error(x, hand, m["handle_stiffness.z"][pressing]))
+        fixed_line = max(fixed_line, _compute_proportionality_error(x, hand, float((x @ hand) / (x @ x))))
         start = edge
     values |= {"error": error, "true_error": true_error, "line": line, "fixed_line": fixed_line}
     return Sample(values, _draw_panels(scenario, run))
@@ -124,8 +124,8 @@ def measure_direct_feedback(ratio: float, seed: int, changes: Changes) -> Sample
     """
     keys = {
         "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TARGET_FORCE}]"
-    } | make_operator_changes(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)  # fmt: skip
-    scenario, run = run_shipped("press_direct", keys)
+    } | make_random_operator_settings(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)  # fmt: skip
+    scenario, run = run_shipped_scenario("press_direct", keys)
     assert isinstance(scenario.pilot, TeleopPilot)
     m, start = run.measured, 0.6 * scenario.duration
     late = m.time > start
@@ -174,7 +174,7 @@ def _evaluate_target_forces(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation((check,), "see the row on the force applied by feel", _describe_held_forces(samples))
 
 
-def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_hand_force_proportionality(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "RMS deviation of the hand's force from the current stiffness times the displacement",
         collect_values(samples, "line"), (0.0, _MAX_DEVIATION),
@@ -226,7 +226,7 @@ _HALVINGS = 4
 _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 
 
-def search_limit(number: int, changes: Changes) -> Sample:
+def search_max_feedback_ratio(number: int, changes: Changes) -> Sample:
     """Search for the largest stable ratio of hand force to contact force in direct feedback, to 20 %.
 
     Args:
@@ -240,25 +240,25 @@ def search_limit(number: int, changes: Changes) -> Sample:
     with tempfile.TemporaryDirectory() as folder:
         keys = {"duration": "25.0", **keys, **changes}
         if hand:
-            keys["pilot.joystick"] = _write_joystick(Path(folder), hand)
+            keys["pilot.joystick"] = _write_scaled_joystick(Path(folder), hand)
         low, high = _SEARCH_RANGE
-        if not _is_stable(low, keys):
+        if not _is_direct_feedback_stable(low, keys):
             return Sample({"limit": 0.0})
-        if _is_stable(high, keys):
+        if _is_direct_feedback_stable(high, keys):
             return Sample({"limit": np.inf})
         for _ in range(_HALVINGS):
             middle = float(np.sqrt(low * high))
-            low, high = (middle, high) if _is_stable(middle, keys) else (low, middle)
+            low, high = (middle, high) if _is_direct_feedback_stable(middle, keys) else (low, middle)
     return Sample({"limit": low})
 
 
-def _is_stable(ratio: float, keys: Changes) -> bool:
+def _is_direct_feedback_stable(ratio: float, keys: Changes) -> bool:
     """Return whether direct feedback keeps the handle within twice its dead band in the last 40 % of a run."""
     values = measure_direct_feedback(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
 
-def _write_joystick(folder: Path, factors: dict[str, float]) -> str:
+def _write_scaled_joystick(folder: Path, factors: dict[str, float]) -> str:
     """Write a joystick file with scaled hand parameters and return its path."""
     source = models_folder() / "joystick" / "joystick.yaml"
     facts = yaml.safe_load(source.read_text(encoding="utf-8"))
@@ -277,9 +277,9 @@ def _evaluate_feedback_limits(samples: Sequence[Sample]) -> Evaluation:
     words = [one[0] for one in FEEDBACK_CONDITIONS]
     published = 50e3 * _PUBLISHED_FORCE_RATIO
     checks = (
-        check_exact("conditions under which direct feedback has a limit", int(exists.sum()),
+        check_deterministic_value("conditions under which direct feedback has a limit", int(exists.sum()),
                     (len(FEEDBACK_CONDITIONS), len(FEEDBACK_CONDITIONS)), "severely restricted: under all"),
-        check_exact("limit of the reflected force for 50 kN in the reference condition",
+        check_deterministic_value("limit of the reflected force for 50 kN in the reference condition",
                     5e4 * limits[0], (published / _SEARCH_ERROR, np.inf),
                     "the published 4.5 N were held, the search is accurate to a factor of"
                     f" {_SEARCH_ERROR:g}", unit="N", published=published),
@@ -337,9 +337,9 @@ def measure_tracking(seed: int, changes: Changes) -> Sample:
         for reflection in ("stiffness", "none"):
             keys = {
                 "pilot.reflection": reflection, "pilot.detent": detent
-            } | make_operator_changes(seed) | dict(changes)  # fmt: skip
-            scenario, run = run_shipped("track_rock", keys)
-            m, facts = run.measured, find_task(scenario).target
+            } | make_random_operator_settings(seed) | dict(changes)  # fmt: skip
+            scenario, run = run_shipped_scenario("track_rock", keys)
+            m, facts = run.measured, find_force_task(scenario).target
             late = m.time > _CONTACT_TIME
             error = m["tip_force.z"] - np.interp(m.time, facts.time, facts.force)
             name = f"{reflection}_{'detent' if detent == 'true' else 'plain'}"
@@ -353,7 +353,7 @@ def _evaluate_tracking(samples: Sequence[Sample]) -> Evaluation:
     checks = []
     for key, words in (("detent", "with detents"), ("plain", "without detents")):
         pairs = np.stack([collect_values(samples, f"{kind}_{key}") for kind in ("none", "stiffness")], 1)
-        checks.append(check_statistic(
+        checks.append(check_bootstrapped_statistic(
             f"mean RMS error without reflection over that with reflection, {words}", pairs,
             lambda rows: float(np.mean(rows[:, 0]) / np.mean(rows[:, 1])),
             (_MIN_IMPROVEMENT, np.inf),
@@ -389,7 +389,7 @@ STIFFNESS_FEEDBACK = (
             ' corresponding z axis"',
             "p. 96, Fig. 6.49",
             "document",
-            _evaluate_proportionality,
+            _evaluate_hand_force_proportionality,
             {"pilot.reflection": "direct_force", "pilot.ratio": "1.0e-4"},
             "direct feedback",
         ),
@@ -415,7 +415,7 @@ STIFFNESS_FEEDBACK = (
             "twice the reflected force",
         ),
     )),
-    Experiment("limit of direct feedback", search_limit, (
+    Experiment("limit of direct feedback", search_max_feedback_ratio, (
         Claim(
             "direct feedback: severely restricted",
             '"direct force feedback method is only possible when the amount of force feedback is'

@@ -22,12 +22,12 @@ from hydrotele.experiments.comparison import (
     Sample,
 )
 from hydrotele.experiments.intervals import (
+    check_bootstrapped_statistic,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import run_shipped
+from hydrotele.experiments.scenario_runs import run_shipped_scenario
 from hydrotele.logs.log import Log
 
 _INITIAL_SAMPLES = 50  # samples from which the document computed the initial parameters
@@ -59,7 +59,7 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
         to the largest parameter; parameters `P1` and interval half-widths `interval P1` [N m].
     """
     scenario, samples, _ = _MACHINE_SCENARIOS[name]
-    shipped, run = run_shipped(scenario, {"seed": str(seed)} | dict(changes))
+    shipped, run = run_shipped_scenario(scenario, {"seed": str(seed)} | dict(changes))
     machine = run.plant.machine
     true = fit_gravity_to_masses(machine).value
     period = shipped.duration / samples
@@ -108,7 +108,7 @@ def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
     ))  # fmt: skip
 
 
-def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Generator) -> Log:
+def simulate_sensor_failures(log: Log, axes: Sequence[str], failures: int, rng: np.random.Generator) -> Log:
     """Return a log in which readings of random sensors are zero for 0.5 to 3 s each.
 
     Args:
@@ -147,19 +147,19 @@ def measure_outliers(seed: int, changes: Changes) -> Sample:
         raise InputError("changes", f"{', '.join(unknown)} unknown; valid: failures, remove")
     given |= changes
     scenario, samples, _ = _MACHINE_SCENARIOS["excavator"]
-    shipped, run = run_shipped(scenario, {"seed": str(seed)})
+    shipped, run = run_shipped_scenario(scenario, {"seed": str(seed)})
     machine, period = run.plant.machine, shipped.duration / samples
     true = fit_gravity_to_masses(machine).value
     rng = np.random.default_rng([seed, 81])
 
-    def identify(log: Log, remove: bool) -> GravityModel:
+    def identify_from_log(log: Log, remove: bool) -> GravityModel:
         return identify_gravity(machine, log, remove_outliers=remove, period=period)
 
-    clean, spoilt, kept = identify(run.measured, False), [], []
+    clean, spoilt, kept = identify_from_log(run.measured, False), [], []
     for _ in range(_FAILURE_SAMPLES):
-        bad = fail_sensors(run.measured, ("boom", "stick", "bucket"), int(given["failures"]), rng)
-        spoilt.append(identify(bad, False))
-        kept.append(identify(bad, bool(given["remove"])))
+        bad = simulate_sensor_failures(run.measured, ("boom", "stick", "bucket"), int(given["failures"]), rng)
+        spoilt.append(identify_from_log(bad, False))
+        kept.append(identify_from_log(bad, bool(given["remove"])))
     number = np.arange(_INITIAL_SAMPLES, len(clean.history))
     return Sample({
         "clean": _compute_scaled_error(clean.value, true),
@@ -174,19 +174,19 @@ def measure_outliers(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _compute_mean_ratio(rows: np.ndarray) -> float:
+def _compute_ratio_of_means(rows: np.ndarray) -> float:
     return float(rows[:, 0].mean() / rows[:, 1].mean())
 
 
-def _collect_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
+def _pair_errors_with_clean(samples: Sequence[Sample], name: str) -> np.ndarray:
     return np.column_stack([collect_values(samples, name), collect_values(samples, "clean")])
 
 
 def evaluate_outlier_effect(samples: Sequence[Sample]) -> Evaluation:
     """Check that sensor failures at least double the error of the gravity parameters."""
     return Evaluation(
-        (check_statistic("error with over error without sensor failures",
-                         _collect_errors(samples, "spoilt"), _compute_mean_ratio, (2.0, np.inf),
+        (check_bootstrapped_statistic("error with over error without sensor failures",
+                         _pair_errors_with_clean(samples, "spoilt"), _compute_ratio_of_means, (2.0, np.inf),
                          "strong: at least twice; no size is published"),),
         note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter against"
         f" {format_values(samples, 'clean', 100.0)} %",
@@ -207,7 +207,7 @@ def evaluate_outlier_removal(samples: Sequence[Sample]) -> Evaluation:
     """Check that removing outliers eliminates 75 % of the parameter error that sensor failures cause."""
     rows = np.column_stack([collect_values(samples, name) for name in ("spoilt", "kept", "clean")])
     return Evaluation(
-        (check_statistic("fraction of the error due to failures that the removal eliminates",
+        (check_bootstrapped_statistic("fraction of the error due to failures that the removal eliminates",
                          rows, _compute_removed_fraction, (0.75, np.inf),
                          "eliminated: at least three quarters; no size is published"),),
         note=f"{format_values(samples, 'kept', 100.0)} % of the largest parameter;"

@@ -8,22 +8,22 @@ import numpy as np
 from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_statistic,
     collect_values,
     format_values,
 )
 from hydrotele.experiments.scenario_runs import (
     compute_cylindrical_pose,
-    make_operator_changes,
-    run_shipped,
+    make_random_operator_settings,
+    run_shipped_scenario,
 )
 from hydrotele.experiments.zhu_two_port import (
     ROUNDING_RANGE,
     make_claim,
-    make_exact_experiment,
+    make_deterministic_experiment,
 )
 from hydrotele.kinematics.from_machine import feller_geometry
 from hydrotele.kinematics.task import (
@@ -36,8 +36,8 @@ from hydrotele.kinematics.task import (
     STICK_LENGTH,
     TOOL_ALONG,
     TOOL_UP,
-    task_forward,
-    task_inverse,
+    compute_tip_pose,
+    solve_joint_angles,
 )
 from hydrotele.machine.machine_file import load_machine
 
@@ -113,16 +113,16 @@ def measure_inverse_kinematics(changes: Changes) -> Sample:
         chain, back, agree = 0.0, 0.0, 0
         for _ in range(_POSE_COUNT):
             q, pose, found = rng.uniform(*ranges.T), np.zeros(5), np.zeros(len(ranges))
-            task_forward(g, q, pose)
+            compute_tip_pose(g, q, pose)
             place = compute_tool_position(g, q)
             there = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
             chain = max(chain, float(np.abs(place - there).max()))
-            status = task_inverse(wrong, pose, q[0], found)
+            status = solve_joint_angles(wrong, pose, q[0], found)
             error = np.abs(compute_tool_position(g, found) - place).max() if status == REACHED else np.inf
             back = max(back, float(error))
             pose[0] = rng.uniform(1.5, 1.5 * (g[BOOM_LENGTH] + g[STICK_LENGTH]))
             pose[2] = rng.uniform(-1.0, 1.5) * g[BOOM_LENGTH]
-            agree += (task_inverse(wrong, pose, q[0], found) == REACHED) == _is_reachable(g, pose)
+            agree += (solve_joint_angles(wrong, pose, q[0], found) == REACHED) == _is_reachable(g, pose)
         values |= {
             f"chain {name}": chain,
             f"back {name}": back,
@@ -151,7 +151,7 @@ def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
 def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
     """Check that the closed-form forward kinematics agrees with the chains of Zhu 1994, Tables 2.1 and 2.2."""
     return Evaluation(tuple(
-        check_exact(f"largest difference of position, {name}", samples[0].values[f"chain {name}"],
+        check_deterministic_value(f"largest difference of position, {name}", samples[0].values[f"chain {name}"],
                     ROUNDING_RANGE, "rounding", unit="m") for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
@@ -159,7 +159,7 @@ def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
     """Check that the closed-form inverse kinematics reaches all poses within the workspace."""
     return Evaluation(tuple(
-        check_exact(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
+        check_deterministic_value(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
                     samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
                     " increases at a straight elbow", unit="m") for name in _MACHINE_TOOLS
     ))  # fmt: skip
@@ -168,14 +168,14 @@ def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
     """Check that inverse kinematics finds a solution if and only if the pose is in reach."""
     return Evaluation(tuple(
-        check_exact(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
+        check_deterministic_value(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
                     f" form and a search over the elbow agree, {name}",
                     samples[0].values[f"agree {name}"], (1.0, 1.0), "agreement for all poses")
         for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
 
-def measure_solutions(changes: Changes) -> Sample:
+def count_inverse_kinematics_solutions(changes: Changes) -> Sample:
     """Count the inverse kinematics solutions of the feller-buncher by both approaches of Zhu 1994.
 
     A candidate is extraneous if the end of the tilt link lies behind the swing axis. Its azimuth
@@ -193,7 +193,7 @@ def measure_solutions(changes: Changes) -> Sample:
     counts = {"first": [], "second": [], "extra_first": [], "extra_second": []}
     for _ in range(_POSE_COUNT):
         q, pose = rng.uniform(*ranges.T), np.zeros(5)
-        task_forward(numbers, q, pose)
+        compute_tip_pose(numbers, q, pose)
         x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
         depth, radius = g.head_depth, g.head_radius
         ahead = radius * math.cos(pose[4]) * math.cos(pose[3]) + depth * math.sin(pose[3])
@@ -226,18 +226,18 @@ def measure_solutions(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def evaluate_solutions(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_solution_counts(samples: Sequence[Sample]) -> Evaluation:
     """Check that the approaches give at most two and four solutions of the inverse kinematics.
 
     Approach 1 must have fewer extraneous candidates than approach 2 (Zhu 1994, p. 24).
     """
     v = samples[0].values
     return Evaluation((
-        check_exact("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
+        check_deterministic_value("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
                     "at most two"),
-        check_exact("largest number of solutions, approach 2", v["second"], (1.0, 4.0),
+        check_deterministic_value("largest number of solutions, approach 2", v["second"], (1.0, 4.0),
                     "at most four"),
-        check_exact("extraneous candidates per pose, approach 1 minus approach 2",
+        check_deterministic_value("extraneous candidates per pose, approach 1 minus approach 2",
                     v["extra_first"] - v["extra_second"], (-np.inf, -1e-9), "fewer"),
     ), note=f"extraneous candidates per pose {v['extra_first']:.2f} of 2 and"
        f" {v['extra_second']:.2f} of 4")  # fmt: skip
@@ -274,7 +274,9 @@ def measure_motion_methods(seed: int, changes: Changes) -> Sample:
     """
     values, radius, time = {}, {}, np.zeros(0)
     for name, keys in _METHOD_CHANGES.items():
-        _, run = run_shipped("joystick_up", make_operator_changes(seed) | _CYCLE_CHANGES | keys | dict(changes))
+        _, run = run_shipped_scenario(
+            "joystick_up", make_random_operator_settings(seed) | _CYCLE_CHANGES | keys | dict(changes)
+        )
         pose, time = compute_cylindrical_pose(run), run.truth.time
         radius[name] = 1e3 * (pose["r"] - pose["r"][0])
         reference = run.measured["tip_reference.r"]
@@ -295,7 +297,7 @@ def measure_motion_methods(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _compute_mean_ratio(rows: np.ndarray) -> float:
+def _compute_ratio_of_means(rows: np.ndarray) -> float:
     return float(rows[:, 0].mean() / max(rows[:, 1].mean(), 1e-12))
 
 
@@ -310,12 +312,12 @@ def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
     """
     return Evaluation(
         (
-            check_statistic("error of the references' radius after two cycles over that after one",
-                            _collect_pairs(samples, "twice jacobian", "once jacobian"), _compute_mean_ratio,
+            check_bootstrapped_statistic("error of the references' radius after two cycles over that after one",
+                            _collect_pairs(samples, "twice jacobian", "once jacobian"), _compute_ratio_of_means,
                             (1.0, np.inf), "it accumulates"),
-            check_statistic("largest deviation of the radius over that by inverse kinematics",
+            check_bootstrapped_statistic("largest deviation of the radius over that by inverse kinematics",
                             _collect_pairs(samples, "stray jacobian", "stray kinematics"),
-                            _compute_mean_ratio, (2.0, np.inf),
+                            _compute_ratio_of_means, (2.0, np.inf),
                             "low: at least twice as much; no size is published"),
         ),
         explanation="the rates are integrated to references of closed joint loops, whose path"
@@ -329,15 +331,15 @@ def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_motion_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Check that inverse kinematics with closed joint loops is at least twice as accurate as joint rates alone.
 
     The joint rates are those of the inverse Jacobian with open joint loops.
     """
     return Evaluation(
-        (check_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
+        (check_bootstrapped_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
                          " alone, over that by inverse kinematics with closed joint loops",
-                         _collect_pairs(samples, "stray rates", "stray kinematics"), _compute_mean_ratio,
+                         _collect_pairs(samples, "stray rates", "stray kinematics"), _compute_ratio_of_means,
                          (2.0, np.inf), "high: at least twice as accurate; no size is published"),),
         explanation="the closed joint loops determine the accuracy: the deviation of inverse"
         " kinematics with open loops is"
@@ -360,7 +362,7 @@ _EDGE_TIME, _REVERSAL_START, _REVERSAL_END = (
 )  # s: edge reached, end of outward command, reversed
 
 
-def measure_edge(seed: int, changes: Changes) -> Sample:
+def simulate_workspace_edge(seed: int, changes: Changes) -> Sample:
     """Simulate the feller-buncher's head commanded beyond the edge of the workspace and back.
 
     Args:
@@ -373,7 +375,7 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
         time from the reversal until the references leave the edge [s]; `speed`: largest joint
         rate [rad/s]; `stick`: angle of the stick from straight at the edge [deg].
     """
-    _, run = run_shipped("feller_steps", make_operator_changes(seed) | _EDGE_CHANGES | dict(changes))
+    _, run = run_shipped_scenario("feller_steps", make_random_operator_settings(seed) | _EDGE_CHANGES | dict(changes))
     pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
     reference = m["tip_reference.r"]
     edge = float(reference[np.searchsorted(m.time, _REVERSAL_START)])
@@ -396,7 +398,7 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def evaluate_edge(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_workspace_edge(samples: Sequence[Sample]) -> Evaluation:
     """Check that the head stops at the edge of the workspace, keeps its height, and leaves it on command."""
     way = "2 % of the travel of 2.9 m, as in the rows of straight lines"
     turned = _REVERSAL_END - _REVERSAL_START
@@ -414,7 +416,7 @@ def evaluate_edge(samples: Sequence[Sample]) -> Evaluation:
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    make_exact_experiment("inverse kinematics", measure_inverse_kinematics, make_claim(
+    make_deterministic_experiment("inverse kinematics", measure_inverse_kinematics, make_claim(
         "links: Denavit-Hartenberg parameters",
         "the chains of Tables 2.1 and 2.2 are those of the arms", "p. 13, Tables 2.1, 2.2,"
         " Figs 2.7, 2.9", evaluate_forward_kinematics, None, "", "input",
@@ -429,11 +431,11 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         ' solution does not exist."', "p. 15", evaluate_reachability, {"stick": 1.1},
         "a stick 10 % too long in the closed form",
     )),
-    make_exact_experiment("number of solutions", measure_solutions, make_claim(
+    make_deterministic_experiment("number of solutions", count_inverse_kinematics_solutions, make_claim(
         "feller-buncher: number of solutions",
         '"We can see there are at most two" (approach 1); "there are at most four solutions to this'
         ' problem" (approach 2); "approach 1 is easier than approach 2, and introduces fewer'
-        ' extraneous solutions"', "p. 24, Fig. 2.9", evaluate_solutions, {"check": 0.0},
+        ' extraneous solutions"', "p. 24, Fig. 2.9", evaluate_solution_counts, {"check": 0.0},
         "extraneous candidates are not rejected",
     )),
     Experiment("methods of resolved motion", measure_motion_methods, (make_claim(
@@ -445,15 +447,15 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "inverse kinematics and closed joint loops: accuracy",
         '"It is clear from these plots that the motion accuracy is high due to the fact inverse'
         " kinematics instead of Jacobian transformations were used and the joint angles of the"
-        ' excavator were under closed-loop control."', "p. 91", evaluate_accuracy,
+        ' excavator were under closed-loop control."', "p. 91", evaluate_motion_accuracy,
         {"servo.position_gain": "0.0"}, "open joint loops everywhere",
     )), _MAX_REPETITIONS),
-    Experiment("edge of the workspace", measure_edge, (Claim(
+    Experiment("edge of the workspace", simulate_workspace_edge, (Claim(
         "feller-buncher: edge of the workspace",
         'if commanded beyond the edge, the references stop there, height and attitude stay'
         ' constant, and the head leaves when the command is reversed; the document says "Resolved'
         ' motion control of the feller-buncher near the edge of workspace needs further study."',
-        "additional to p. 112", "additional", evaluate_edge, {"servo.axis_gains": "{stick: 0.0}"},
+        "additional to p. 112", "additional", evaluate_workspace_edge, {"servo.axis_gains": "{stick: 0.0}"},
         "no position loop of the stick",
     ),), _MAX_REPETITIONS),
 )  # fmt: skip

@@ -26,8 +26,8 @@ from hydrotele.experiments.intervals import (
 )
 from hydrotele.experiments.scenario_runs import (
     compute_cylindrical_pose,
-    make_operator_changes,
-    run_shipped,
+    make_random_operator_settings,
+    run_shipped_scenario,
 )
 from hydrotele.run.run import Run
 
@@ -66,7 +66,7 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
     keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}"}
-    _, run = run_shipped("joystick_up", keys | make_operator_changes(seed) | dict(changes))
+    _, run = run_shipped_scenario("joystick_up", keys | make_random_operator_settings(seed) | dict(changes))
     pose, time = compute_cylindrical_pose(run), run.truth.time
     moved = pose["z" if axis == "z" else "r"]
     travel = float(sign * (moved[-1] - moved[0]))
@@ -124,7 +124,7 @@ _CAUSE_OPERATORS = 5  # number of operators with whom the causes of an oscillati
 _FAST_COORDINATES = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale: 20.0}, z: {speed: 3.0, scale: 120.0}, attitude: {speed: 2.0, scale: 5.0}}"  # noqa: E501
 
 
-def measure_step_response(run: Run) -> tuple[float, int]:
+def measure_overshoot_and_reversals(run: Run) -> tuple[float, int]:
     """Return the largest overshoot of the tip and the number of reversals about the goals of a steering run.
 
     Args:
@@ -147,7 +147,7 @@ def measure_step_response(run: Run) -> tuple[float, int]:
     return overshoot, count
 
 
-def measure_steering(seed: int, changes: Changes) -> Sample:
+def compare_rate_and_position_control(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who steers the tip to goals by sight, under rate and under position control.
 
     For the first operators the possible causes of an oscillation are varied: no tremor, a machine
@@ -176,9 +176,9 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
         cases = {name: cases[name] for name in ("rate", "position")}
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = {"pilot.mount": "table"} | make_operator_changes(seed) | keys | dict(changes)
-        _, run = run_shipped("steer", keys)
-        overshoot, count = measure_step_response(run)
+        keys = {"pilot.mount": "table"} | make_random_operator_settings(seed) | keys | dict(changes)
+        _, run = run_shipped_scenario("steer", keys)
+        overshoot, count = measure_overshoot_and_reversals(run)
         values |= {f"{name}_overshoot": overshoot, f"{name}_reversals": float(count)}
         if name in ("rate", "position"):
             pose = compute_cylindrical_pose(run)
@@ -189,7 +189,7 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _evaluate_steering(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_rate_and_position_control(samples: Sequence[Sample]) -> Evaluation:
     smooth = (collect_values(samples, "rate_overshoot") < _MAX_OVERSHOOT) & (
         collect_values(samples, "rate_reversals") < _MIN_REVERSALS
     )
@@ -232,7 +232,7 @@ _RAMPS = {"x": (1.0, 7.0, 4.0, 0.3, 2.0), "z": (9.0, 15.0, 4.0, 0.4, 2.0)}
 _DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 
-def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
+def measure_handle_force_curve(detent: str, seed: int, changes: Changes) -> Sample:
     """Measure the hand force over displacement while the handle moves slowly from its centre to its stop.
 
     Args:
@@ -243,8 +243,8 @@ def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
     Returns:
         Stiffness [N/mm], nonlinearity, and force drop at the edge of the dead band [N] per axis.
     """
-    keys = {"pilot.detent": detent} | make_operator_changes(seed) | dict(changes)
-    _, run = run_shipped("handle_ramp", keys)
+    keys = {"pilot.detent": detent} | make_random_operator_settings(seed) | dict(changes)
+    _, run = run_shipped_scenario("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
     for axis, (start, end, *_) in _RAMPS.items():
         inside = (m.time > start) & (m.time < end)
@@ -319,16 +319,16 @@ def measure_joint_steps(seed: int, changes: Changes) -> Sample:
     Returns:
         Pressure oscillation, overshoot, remaining error and oscillation of the angle per joint.
     """
-    values, panels = _measure_joint_steps(seed, changes)
+    values, panels = _simulate_joint_steps(seed, changes)
     if seed == 1:
-        slower, _ = _measure_joint_steps(seed, {"servo.position_gain": "2.0"} | dict(changes))
+        slower, _ = _simulate_joint_steps(seed, {"servo.position_gain": "2.0"} | dict(changes))
         for key in ("overshoot", "ringing"):
             values[f"boom_{key}_slower"] = slower[f"boom_{key}"]
     return Sample(values, panels)
 
 
-def _measure_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float], tuple[Panel, ...]]:
-    _, run = run_shipped("feller_joint_steps", {"seed": str(seed)} | dict(changes))
+def _simulate_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float], tuple[Panel, ...]]:
+    _, run = run_shipped_scenario("feller_joint_steps", {"seed": str(seed)} | dict(changes))
     m, values, panels = run.measured, {}, []
     table = run.scenario.pilot.columns  # pyright: ignore[reportAttributeAccessIssue]
     for name, (start, _) in _JOINT_STEPS.items():
@@ -351,7 +351,7 @@ def _measure_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float],
     return values, tuple(panels)
 
 
-def _evaluate_pressure(joint: str, samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_pressure_oscillation(joint: str, samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "pressure from peak to peak over the pressure before the step",
         collect_values(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
@@ -371,7 +371,7 @@ def _make_pressure_claim(joint: str) -> Claim:
         ' pressures oscillations during free motion"',
         f"p. 107, Fig. 6.{_JOINT_STEPS[joint][1]}",
         "document",
-        partial(_evaluate_pressure, joint),
+        partial(_evaluate_pressure_oscillation, joint),
         _SLOW_RAMPS,
         "slow ramps instead of steps",
         (f"{joint} angle [rad]", f"head-side pressure of the {joint} [MPa]"),
@@ -402,7 +402,7 @@ _COORDINATE_STEPS = {"r": 1.0, "theta": 6.0, "z": 11.0, "attitude": 16.0, "head"
 _MAX_CROSS_MOTION = 0.1  # motion of another coordinate over the step of that coordinate
 
 
-def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
+def measure_coordinate_steps(seed: int, changes: Changes) -> Sample:
     """Simulate joystick steps in each of the five task coordinates, and measure the pose.
 
     Args:
@@ -412,7 +412,7 @@ def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
     Returns:
         Step, overshoot, remaining error, and motion of the other coordinates per coordinate.
     """
-    _, run = run_shipped("feller_steps", make_operator_changes(seed) | dict(changes))
+    _, run = run_shipped_scenario("feller_steps", make_random_operator_settings(seed) | dict(changes))
     m, values, panels = run.measured, {}, []
     for name, start in _COORDINATE_STEPS.items():
         inside = (m.time >= start) & (m.time < start + 4.9)
@@ -435,7 +435,7 @@ def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _evaluate_resolved_steps(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_coordinate_steps(samples: Sequence[Sample]) -> Evaluation:
     checks = [
         check_mean(f"{words} of {name}", collect_values(samples, f"{name}_{key}"), (-np.inf, limit),
                    "a limit of this project")
@@ -459,7 +459,7 @@ _SLOW_RAMPS = {
     " tilt: [0.9, 0.9, 0.9, 0.9, 0.9, 1.0, 1.0]}",
 }  # fmt: skip
 
-STEERING = Experiment("steering", measure_steering, (
+STEERING = Experiment("steering", compare_rate_and_position_control, (
     Claim(
         "rate against position control",
         '"The mismatch of the fast joystick and the slow excavator could cause oscillation under'
@@ -467,7 +467,7 @@ STEERING = Experiment("steering", measure_steering, (
         ' when the machine is under rate control"',
         "p. 90",
         "document",
-        _evaluate_steering,
+        _evaluate_rate_and_position_control,
         {"pilot.mode": "rate"},
         "rate control in both",
     ),
@@ -476,7 +476,7 @@ STEERING = Experiment("steering", measure_steering, (
 LINES = tuple(Experiment(f"line {one}", partial(measure_line, one), (_make_line_claim(one),), 10) for one in _LINES)
 
 HANDLE_RAMPS = (
-    Experiment("handle ramp with detents", partial(measure_handle_ramp, "true"), (
+    Experiment("handle ramp with detents", partial(measure_handle_force_curve, "true"), (
         Claim(
             "detents",
             '"Within the joystick position deadband, it is the same as the single slope approach.'
@@ -489,7 +489,7 @@ HANDLE_RAMPS = (
             "detents off",
         ),
     )),
-    Experiment("handle ramp", partial(measure_handle_ramp, "false"), (
+    Experiment("handle ramp", partial(measure_handle_force_curve, "false"), (
         Claim(
             "conventional centring force",
             '"the restoring force is a linear function of the position error. The bigger the'
@@ -517,14 +517,14 @@ STEPS = (
             "three times the position gain, no damping by pressure",
         ),
     ), 6),
-    Experiment("resolved steps", measure_resolved_steps, (
+    Experiment("resolved steps", measure_coordinate_steps, (
         Claim(
             "feller-buncher: steps of all five coordinates",
             "the measured pose follows every step of the joystick, the other coordinates stay"
             " constant",
             "additional to Fig. 6.56, which shows joints",
             "additional",
-            _evaluate_resolved_steps,
+            _evaluate_coordinate_steps,
             _SLOW_SERVO,
             "joint servos with a tenth of the gain and 60 % of the feedforward",
         ),

@@ -18,8 +18,8 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_exact, check_mean, collect_values
-from hydrotele.experiments.zhu_two_port import make_claim, make_exact_experiment
+from hydrotele.experiments.intervals import check_deterministic_value, check_mean, collect_values
+from hydrotele.experiments.zhu_two_port import make_claim, make_deterministic_experiment
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.levitation import pose_resolution
@@ -33,7 +33,7 @@ _MIN_STIFFNESS, _MAX_STIFFNESS = (
 _DAMPING = 6.1  # 1/s
 
 
-def measure_counter_example(changes: Changes) -> Sample:
+def integrate_rising_damping(changes: Changes) -> Sample:
     """Integrate a mass on a spring whose damping increases exponentially (4.6) or slowly (4.7).
 
     With exponential damping the mass stops before it reaches its rest position.
@@ -47,16 +47,16 @@ def measure_counter_example(changes: Changes) -> Sample:
     """
     given = merge_settings({"stiffness": 1.0}, changes)
 
-    def solve(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
-        def motion(t: float, state: np.ndarray) -> list[float]:
+    def integrate_displacement(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
+        def compute_state_derivative(t: float, state: np.ndarray) -> list[float]:
             return [state[1], -damping(t) * state[1] - given["stiffness"] * state[0]]
 
         times = np.linspace(0.0, last, 400)
-        found = solve_ivp(motion, (0.0, last), [2.0, -1.0], "Radau", times, rtol=1e-9, atol=1e-12)
+        found = solve_ivp(compute_state_derivative, (0.0, last), [2.0, -1.0], "Radau", times, rtol=1e-9, atol=1e-12)
         return times, found.y[0]
 
-    time, place = solve(lambda t: 2.0 + np.exp(t), 12.0)
-    slow_time, slow = solve(lambda t: 2.0 + 0.5 * t, 100.0)
+    time, place = integrate_displacement(lambda t: 2.0 + np.exp(t), 12.0)
+    slow_time, slow = integrate_displacement(lambda t: 2.0 + 0.5 * t, 100.0)
     return Sample({"end": float(place[-1]), "slow": float(abs(slow[-1]))}, (
         Panel("x [1]", time, {"B = 2 + exp(t)": place, "1 + exp(-t)": 1.0 + np.exp(-time)},
               errors={"difference": place - 1.0 - np.exp(-time)}, error_label="difference [1]"),
@@ -64,17 +64,17 @@ def measure_counter_example(changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def evaluate_counter_example(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_rising_damping(samples: Sequence[Sample]) -> Evaluation:
     """Check that a mass with exponentially increasing damping stops at x = 1 instead of 0 (Zhu 1994, 4.6).
 
     With slowly increasing damping it must return to 0.
     """
     v = samples[0].values
     return Evaluation((
-        check_exact("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
+        check_deterministic_value("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
                     "1 + exp(-12) is 6 10^-6 above 1; the remaining tolerance is for integration",
                     published=1.0),
-        check_exact("magnitude of x after 100 s with B = 2 + t/2, which satisfies (4.7)", v["slow"],
+        check_deterministic_value("magnitude of x after 100 s with B = 2 + t/2, which satisfies (4.7)", v["slow"],
                     (0.0, 0.01), "it decays as 1/t^2, from 2 to some 10^-3"),
     ), note="K = 1, as required by the printed solution 1 + exp(-t)")  # fmt: skip
 
@@ -103,14 +103,14 @@ def measure_worst_switching(changes: Changes) -> Sample:
 def evaluate_worst_switching(samples: Sequence[Sample]) -> Evaluation:
     """Check that the motion of a slightly damped mass grows under the worst switching of its stiffness."""
     return Evaluation((
-        check_exact("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
+        check_deterministic_value("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
                     " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
                     "the motion grows, so that the system is unstable"),
     ))  # fmt: skip
 
 
 @compiled
-def integrate_motion(damping, stiffness, position, speed, step, path):
+def integrate_varying_stiffness(damping, stiffness, position, speed, step, path):
     """Integrate `x'' = -B x' - K(t) x` of a unit mass by the Runge-Kutta method, with constant K in each step.
 
     Args:
@@ -140,7 +140,7 @@ def integrate_motion(damping, stiffness, position, speed, step, path):
         path[i + 1, 0], path[i + 1, 1] = x, v
 
 
-def draw_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
+def sample_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw (count,) random stiffness values [1/s^2], constant between jumps at random times.
 
     All values are within [K_min, K_max].
@@ -157,11 +157,11 @@ def draw_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
 
 def _integrate_path(damping: float, stiffness: np.ndarray, start: tuple[float, float]) -> np.ndarray:
     path = np.empty((len(stiffness) + 1, 2))
-    integrate_motion(damping, stiffness, *start, _TIME_STEP, path)
+    integrate_varying_stiffness(damping, stiffness, *start, _TIME_STEP, path)
     return path
 
 
-def measure_theorem(seed: int, changes: Changes) -> Sample:
+def simulate_switched_stiffness(seed: int, changes: Changes) -> Sample:
     """Integrate motions with randomly switched stiffness, to test the stability theorem 4-2 of Zhu 1994.
 
     Args:
@@ -182,7 +182,7 @@ def measure_theorem(seed: int, changes: Changes) -> Sample:
     }
     for trial in range(20):
         angle = rng.uniform(0.0, 2.0 * np.pi)
-        stiffness = draw_switched_stiffness(rng, count)
+        stiffness = sample_switched_stiffness(rng, count)
         path = _integrate_path(damping, stiffness, (float(np.cos(angle)), float(np.sin(angle))))
         away = np.hypot(*path.T) > 1e-6
         speed = path[away, 1]
@@ -231,7 +231,7 @@ def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
         check_mean("largest distance from the origin after 40 s over that at the start",
                    collect_values(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
                    " rate with K_min is 0.17 1/s, which gives 10^-3"),
-        check_exact("largest number of crossings of the x axis",
+        check_deterministic_value("largest number of crossings of the x axis",
                     float(collect_values(samples, "crossings").max()), (0.0, 1.0), "at most once"),
     ))  # fmt: skip
 
@@ -239,7 +239,7 @@ def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_path_bounds(samples: Sequence[Sample]) -> Evaluation:
     """Check that paths in the (x, x') plane stay between those of constant K_min and K_max."""
     return Evaluation((
-        check_exact("largest distance by which a path lies outside",
+        check_deterministic_value("largest distance by which a path lies outside",
                     float(collect_values(samples, "outside").max()), (0.0, 1e-3),
                     "error of the interpolation between steps of 1 ms"),
     ))  # fmt: skip
@@ -271,7 +271,7 @@ def measure_published_gains(changes: Changes) -> Sample:
         alone = StiffnessAxis(mass, given["damping"] * damping, nominal, least, most)
         for spring in (alone, StiffnessAxis(mass + hand[0], alone.damping + given["damping"] * hand[1],
                        nominal + hand[2], least + hand[2], most + hand[2])):  # fmt: skip
-            margins.append(spring.theorem_margin)
+            margins.append(spring.stability_theorem_margin)
             growths.append(spring.half_swing_growth)
     return Sample({"margin": max(margins), "growth": max(growths)})
 
@@ -280,14 +280,14 @@ def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
     """Check that no joystick axis satisfies (4.14) but all decay under the worst stiffness switching."""
     v = samples[0].values
     return Evaluation((
-        check_exact("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
+        check_deterministic_value("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
                     (-np.inf, -1e-9), "no axis satisfies (4.14)", unit="(N s/m)^2"),
-        check_exact("largest growth per half swing with the worst switching", v["growth"],
+        check_deterministic_value("largest growth per half swing with the worst switching", v["growth"],
                     (0.0, 1.0 - 1e-9), "below 1 the motion decays for any change of stiffness"),
     ), note="masses of joystick and hand are assumptions of models/joystick")  # fmt: skip
 
 
-def measure_joystick(changes: Changes) -> Sample:
+def compute_joystick_resolution(changes: Changes) -> Sample:
     """Compute the condition number of the levitated joystick's coil matrix and its pose resolution.
 
     Args:
@@ -309,40 +309,40 @@ def measure_joystick(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def evaluate_condition(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_coil_condition_number(samples: Sequence[Sample]) -> Evaluation:
     """Check that the matrix from coil currents to forces and torques is well conditioned (below 10)."""
     return Evaluation((
-        check_exact("condition number of M, torques divided by the coils' radius",
+        check_deterministic_value("condition number of M, torques divided by the coils' radius",
                     samples[0].values["condition"], (1.0, 10.0),
                     "well-conditioned: within a factor of ten"),
     ))  # fmt: skip
 
 
-def evaluate_resolution(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_pose_resolution(samples: Sequence[Sample]) -> Evaluation:
     """Check that the joystick resolves about 1 um and 0.001 deg with photodiodes of 1 um steps."""
     v, reason = samples[0].values, "approximately: up to the printed figure"
     return Evaluation((
-        check_exact("standard deviation of the position", v["translation"], (0.0, 1.0), reason,
+        check_deterministic_value("standard deviation of the position", v["translation"], (0.0, 1.0), reason,
                     unit="um", published=1.0),
-        check_exact("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
+        check_deterministic_value("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
                     published=1e-3),
     ), note="three beams on photodiodes with steps of 1 um")  # fmt: skip
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    make_exact_experiment("damping that rises", measure_counter_example, make_claim(
+    make_deterministic_experiment("damping that rises", integrate_rising_damping, make_claim(
         "counter-example of rising damping",
         '"the above system has solution x(t)" = 1 + e^-t "which goes to x(oo)" = 1 "instead" of 0',
-        "p. 53, Eq. 4.6", evaluate_counter_example, {"stiffness": 2.0}, "a spring of K = 2",
+        "p. 53, Eq. 4.6", evaluate_rising_damping, {"stiffness": 2.0}, "a spring of K = 2",
     )),
-    make_exact_experiment("worst switching", measure_worst_switching, make_claim(
+    make_deterministic_experiment("worst switching", measure_worst_switching, make_claim(
         "stiffness that switches: unstable",
         '"a slightly damped mass-damper-spring system goes unstable if we set the spring constant'
         " to a large value whenever the mass moves towards the equihbrium point and a small value"
         ' whenever the mass moves away from it"', "p. 54", evaluate_worst_switching, {"ratio": 1.0},
         "critical damping",
     )),
-    Experiment("theorem 4-2", measure_theorem, (make_claim(
+    Experiment("theorem 4-2", simulate_switched_stiffness, (make_claim(
         "theorem 4-2: stable, one crossing at most",
         '"Under these conditions, the system is uniformly asymptotically stable"; the trajectory'
         ' "can cross the x axis at most once"',
@@ -354,21 +354,21 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "p. 61, Figs 4.28, 4.29", evaluate_path_bounds, {"damping": 0.3},
         "damping that is too small for the condition",
     ))),
-    make_exact_experiment("published gains", measure_published_gains, make_claim(
+    make_deterministic_experiment("published gains", measure_published_gains, make_claim(
         "published gains: worst switching dies out",
         "no axis of Tables 6.7 and 6.9 satisfies the condition of theorem 4-2, but the motion with"
         " the worst switching between their bounds decays",
         "additional to p. 55, Tables 6.7, 6.9", evaluate_published_gains,
         {"damping": 0.1}, "a tenth of the damping", "additional",
     )),
-    make_exact_experiment("levitated joystick", measure_joystick, make_claim(
+    make_deterministic_experiment("levitated joystick", compute_joystick_resolution, make_claim(
         "joystick: condition of the coils' map",
-        '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", evaluate_condition,
+        '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", evaluate_coil_condition_number,
         {"radius": 100.0}, "torques scaled with a lever a hundred times as long", "input",
     ), make_claim(
         "joystick: resolution of the pose",
         '"approximately 1" um "for translation and 0.001" deg "for rotation"',
-        "p. 65, Figs 5.31, 5.32", evaluate_resolution, {"step": 10.0},
+        "p. 65, Figs 5.31, 5.32", evaluate_pose_resolution, {"step": 10.0},
         "photodiodes with steps of 10 um", "input",
     )),
 )  # fmt: skip

@@ -9,7 +9,7 @@ from functools import partial
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
-from hydrotele.experiments.intervals import check_exact
+from hydrotele.experiments.intervals import check_deterministic_value
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
@@ -260,7 +260,7 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
 
 def _evaluate_table(row: str, samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
-    check = check_exact(
+    check = check_deterministic_value(
         "entries that differ from the printed values", values[f"{row}: differ"], (0.0, 0.0),
         "half of the last printed digit",
     )  # fmt: skip

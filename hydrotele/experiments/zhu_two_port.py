@@ -22,13 +22,13 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_exact, check_mean, collect_values, format_values
+from hydrotele.experiments.intervals import check_deterministic_value, check_mean, collect_values, format_values
 from hydrotele.experiments.scenario_runs import (
-    make_operator_changes,
+    make_random_operator_settings,
     read_true_channel,
-    run_shipped,
+    run_shipped_scenario,
 )
-from hydrotele.teleop.analysis import TeleoperatorAxis, gain_margin, load_teleop_case
+from hydrotele.teleop.analysis import TeleoperatorAxis, find_gain_margin, load_teleop_case
 from hydrotele.teleop.findings import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
@@ -47,12 +47,12 @@ NOTICEABLE_DIFFERENCE = 0.23  # just noticeable relative difference of a complia
 PASSIVE_NORM = 1.0 + 1e-9  # largest scattering norm of a passive two-port, with rounding
 
 
-def make_exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
+def make_deterministic_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
     """Return an experiment without randomness, which is run once."""
-    return Experiment(name, partial(_measure_once, measure), claims, fixed_repetitions=1)
+    return Experiment(name, partial(_measure_without_seed, measure), claims, fixed_repetitions=1)
 
 
-def _measure_once(measure: Callable[[Changes], Sample], seed: int, changes: Changes) -> Sample:
+def _measure_without_seed(measure: Callable[[Changes], Sample], seed: int, changes: Changes) -> Sample:
     return measure(changes)
 
 
@@ -61,7 +61,7 @@ def load_shipped_case() -> TeleoperatorAxis:
     return load_teleop_case().to_axis().with_delay(0.0)
 
 
-def make_identical_case() -> TeleoperatorAxis:
+def make_identical_sides_case() -> TeleoperatorAxis:
     """Return the shipped teleoperator axis with the master's parameters for master and slave."""
     case = load_shipped_case()
     return dataclasses.replace(case, slave=case.master, slave_control=case.master_control)
@@ -121,9 +121,9 @@ def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
     """Check that the formulas of hybrid matrix (3.11) and felt impedance (3.12) solve the equations."""
     values, reason = samples[0].values, "rounding: two solutions of the same equations"
     return Evaluation((
-        check_exact("largest relative error of the hybrid matrix (3.11)", values["matrix"],
+        check_deterministic_value("largest relative error of the hybrid matrix (3.11)", values["matrix"],
                     ROUNDING_RANGE, reason),
-        check_exact("of the felt impedance (3.12)", values["felt"], ROUNDING_RANGE, reason),
+        check_deterministic_value("of the felt impedance (3.12)", values["felt"], ROUNDING_RANGE, reason),
     ))  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
     """
     values = samples[0].values
     return Evaluation(
-        (check_exact("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
+        (check_deterministic_value("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
                      values["least"], (PASSIVE_NORM, np.inf), "above 1 is not passive (3.6)"),),
         note=f"a lossless line with the same delays has {values['lossless']:.3g}",
     )  # fmt: skip
@@ -173,7 +173,7 @@ def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
 _DELAYS, _GAIN_FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30.0])
 
 
-def measure_nyquist(changes: Changes) -> Sample:
+def compare_nyquist_with_simulation(changes: Changes) -> Sample:
     """Compare predicted stability with the simulated impulse response of four teleoperator structures.
 
     The prediction applies the argument principle to the loop transfer functions.
@@ -197,11 +197,11 @@ def measure_nyquist(changes: Changes) -> Sample:
     return Sample({"fraction": right / cells, "cells": float(cells)})
 
 
-def evaluate_nyquist(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_nyquist_agreement(samples: Sequence[Sample]) -> Evaluation:
     """Check that the Nyquist criterion and the simulated impulse response agree for all loops."""
     values = samples[0].values
     return Evaluation((
-        check_exact(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
+        check_deterministic_value(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
                     " gains) in which the criterion and a simulated kick agree", values["fraction"],
                     (1.0, 1.0), "the criterion is necessary and sufficient"),
     ))  # fmt: skip
@@ -210,7 +210,7 @@ def evaluate_nyquist(samples: Sequence[Sample]) -> Evaluation:
 # --- p. 32 to 37: coordinating force and force feedback -------------------------------------------
 
 
-def measure_coordinating_force(changes: Changes) -> Sample:
+def compare_with_mechanical_equivalent(changes: Changes) -> Sample:
     """Compare the position-position structure with two masses joined by a spring and a damper.
 
     Args:
@@ -221,7 +221,7 @@ def measure_coordinating_force(changes: Changes) -> Sample:
         `norm`: largest scattering norm; `difference`: relative difference of hybrid matrices.
     """
     given = merge_settings({"slave_gain": 1.0, "coupling_gain": 1.0}, changes)
-    case = make_identical_case()
+    case = make_identical_sides_case()
     control, k = case.master_control, given["slave_gain"]
     held = Impedance(0.0, k * control.damping, k * control.stiffness)
     port = dataclasses.replace(case, slave_control=held).make_port("position_position")
@@ -241,7 +241,7 @@ def measure_coordinating_force(changes: Changes) -> Sample:
 def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
     """Check that the position-position structure is passive: its scattering norm is at most 1."""
     return Evaluation((
-        check_exact("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
+        check_deterministic_value("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
                     (0.0, PASSIVE_NORM), "passive (3.6), with rounding"),
     ))  # fmt: skip
 
@@ -249,7 +249,7 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
     """Check that the position-position structure has the hybrid matrix of two masses joined by a spring."""
     return Evaluation((
-        check_exact("largest relative difference of the hybrid matrices",
+        check_deterministic_value("largest relative difference of the hybrid matrices",
                     samples[0].values["difference"], ROUNDING_RANGE, "rounding"),
     ))  # fmt: skip
 
@@ -257,7 +257,7 @@ def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
 _FIRST_TARGET_DURATION = 16.0  # duration of the first target, 20 kN [s]
 
 
-def measure_contact_error(seed: int, changes: Changes) -> Sample:
+def measure_contact_position_error(seed: int, changes: Changes) -> Sample:
     """Compare the position error due to a contact force with the measurement noise.
 
     The excavator presses with 20 kN under stiffness feedback. The joystick's stiffness is also
@@ -270,8 +270,8 @@ def measure_contact_error(seed: int, changes: Changes) -> Sample:
     Returns:
         Position error and noise [m], their ratio, contact force [N], and relative stiffness error.
     """
-    keys = {"duration": str(_FIRST_TARGET_DURATION)} | make_operator_changes(seed) | dict(changes)
-    scenario, run = run_shipped("press_stiffness", keys)
+    keys = {"duration": str(_FIRST_TARGET_DURATION)} | make_random_operator_settings(seed) | dict(changes)
+    scenario, run = run_shipped_scenario("press_stiffness", keys)
     m = run.measured
     height = np.interp(m.time, run.truth.time, read_true_channel(run, "truth.tip.z"))
     error = m["tip_reference.z"] - m["tip_pose.z"]
@@ -316,7 +316,7 @@ def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
     ))  # fmt: skip
 
 
-def measure_direct_force(changes: Changes) -> Sample:
+def compute_direct_force_margins(changes: Changes) -> Sample:
     """Compute the gain margins of direct force feedback under rate and under position control.
 
     Args:
@@ -331,14 +331,14 @@ def measure_direct_force(changes: Changes) -> Sample:
     case = dataclasses.replace(case, task=task)
     late = case.with_delay(0.02)
     return Sample({
-        "rate": gain_margin(case, "rate_force"),
-        "position": gain_margin(case, "position_force"),
-        "late_rate": gain_margin(late, "rate_force"),
-        "late_position": gain_margin(late, "position_force"),
+        "rate": find_gain_margin(case, "rate_force"),
+        "position": find_gain_margin(case, "position_force"),
+        "late_rate": find_gain_margin(late, "rate_force"),
+        "late_position": find_gain_margin(late, "position_force"),
     })  # fmt: skip
 
 
-def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_rate_force_margin(samples: Sequence[Sample]) -> Evaluation:
     """Check that rate control with direct force feedback has a stability limit even without delay.
 
     It must be below that of position control.
@@ -347,10 +347,10 @@ def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
     ratio = v["rate"] / v["position"]
     return Evaluation(
         (
-            check_exact("largest stable factor of the reflected force under rate control, without"
+            check_deterministic_value("largest stable factor of the reflected force under rate control, without"
                         " delay", v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
                         " reflection, 450 N in the hand for 25 kN, counts as no limit"),
-            check_exact("the same over that of position control", ratio, (0.0, 1.0 - 1e-9),
+            check_deterministic_value("the same over that of position control", ratio, (0.0, 1.0 - 1e-9),
                         "rate control is less stable"),
         ),
         note=f"with 20 ms each way {v['late_rate']:.2f} under rate control,"
@@ -359,14 +359,14 @@ def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
     )  # fmt: skip
 
 
-def evaluate_position_force(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_position_force_margin(samples: Sequence[Sample]) -> Evaluation:
     """Check that position control with direct force feedback becomes stable if its gain is reduced.
 
     With the shipped gain and a delay of 20 ms each way it is unstable.
     """
     v = samples[0].values
     return Evaluation(
-        (check_exact("largest stable factor of the reflected force under position control, 20 ms"
+        (check_deterministic_value("largest stable factor of the reflected force under position control, 20 ms"
                      " each way", v["late_position"], (1e-9, 1.0 - 1e-9),
                      "unstable with the shipped gain, stable with a smaller gain"),),
         note=f"without delay: {v['position']:.3g}",
@@ -399,16 +399,16 @@ def measure_impedance_difference(changes: Changes) -> Sample:
 
 
 def _make_impedance_evaluation(*structures: str) -> Callable[[Sequence[Sample]], Evaluation]:
-    def judge(samples: Sequence[Sample]) -> Evaluation:
+    def evaluate_impedance_difference(samples: Sequence[Sample]) -> Evaluation:
         return Evaluation(tuple(
-            check_exact(
+            check_deterministic_value(
                 f"largest relative difference of the felt and the task's impedance,"
                 f" {name.replace('_', '-')}", samples[0].values[name], (NOTICEABLE_DIFFERENCE, np.inf),
                 "23 % of a compliance is noticeable (Tan 1995)",
             ) for name in structures
         ))  # fmt: skip
 
-    return judge
+    return evaluate_impedance_difference
 
 
 def make_claim(
@@ -420,26 +420,26 @@ def make_claim(
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    make_exact_experiment("hybrid matrix", measure_hybrid_matrix, make_claim(
+    make_deterministic_experiment("hybrid matrix", measure_hybrid_matrix, make_claim(
         "general structure: hybrid matrix",
         '"The hybrid matrix of this two-port teleoperator system can be easily derived" (3.11,'
         " 3.12)", "p. 30, Fig. 3.13", evaluate_hybrid_matrix, {"velocity_back_sign": -1.0},
         "the returned velocity has the wrong sign in the equations",
     )),
-    make_exact_experiment("delayed channel", measure_delayed_channel, make_claim(
+    make_deterministic_experiment("delayed channel", measure_delayed_channel, make_claim(
         "delay: not passive",
         '"It can be shown that the standard method of communicating forces and velocity between the'
         ' master and slave in a teleoperator system leads to a nonpassive system for any time'
         ' delay."', "p. 28, Eq. 3.8", evaluate_delayed_channel, {"wave_impedance": 1.0},
         "a lossless line instead of the delayed channel",
     )),
-    make_exact_experiment("Nyquist criterion", measure_nyquist, make_claim(
+    make_deterministic_experiment("Nyquist criterion", compare_nyquist_with_simulation, make_claim(
         "closed-loop stability by the loop transfer functions",
         'the Nyquist plots of LG1 and LG2 "can not encircle the critical point" for a stable'
-        " system", "p. 31, Fig. 3.14", evaluate_nyquist, {"simulated_task": 0.01},
+        " system", "p. 31, Fig. 3.14", evaluate_nyquist_agreement, {"simulated_task": 0.01},
         "the simulated task is a hundred times softer than that of the criterion",
     )),
-    make_exact_experiment("coordinating force", measure_coordinating_force, make_claim(
+    make_deterministic_experiment("coordinating force", compare_with_mechanical_equivalent, make_claim(
         "position-position structure: passive",
         '"coordinating force (position error) method can be shown to be passive under position'
         ' control"; "any circuit network made up of strictly passive" "components is itself'
@@ -452,7 +452,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         " masses joined by a spring and a damper", "p. 33, Fig. 3.17", evaluate_mechanical_equivalent,
         {"coupling_gain": 2.0}, "a spring and a damper twice as large between the masses",
     )),
-    Experiment("pressing", measure_contact_error, (make_claim(
+    Experiment("pressing", measure_contact_position_error, (make_claim(
         "rate-position structure: position error below noise",
         '"the position gain is so high for hydraulic mobile machines such as excavators and'
         ' feller-bunchers that there is virtually no position error for feedback considering the'
@@ -464,18 +464,18 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "p. 51, Fig. 4.24", evaluate_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
         "input",
     )), max_repetitions=6),
-    make_exact_experiment("direct force, linear", measure_direct_force, make_claim(
+    make_deterministic_experiment("direct force, linear", compute_direct_force_margins, make_claim(
         "position-force structure: reduced gain",
         '"For position control with direct force feedback, stability can be achieved by reducing'
-        ' the loop gain"', "p. 36, Fig. 3.19", evaluate_position_force, {"task": 1e-6},
+        ' the loop gain"', "p. 36, Fig. 3.19", evaluate_position_force_margin, {"task": 1e-6},
         "a task a million times softer, which reflects no force",
     ), make_claim(
         "rate control with direct force feedback",
         '"Therefore rate control with direct force feedback tends to be unstable even without'
-        ' time-delay in the system."', "p. 37", evaluate_rate_force, {"task": 1e-6},
+        ' time-delay in the system."', "p. 37", evaluate_rate_force_margin, {"task": 1e-6},
         "a task a million times softer, which reflects no force",
     )),
-    make_exact_experiment("felt impedance", measure_impedance_difference, make_claim(
+    make_deterministic_experiment("felt impedance", measure_impedance_difference, make_claim(
         "structures that are not transparent, position control",
         '"the position-position structure does not provide transparency, nor does the'
         ' position-force structure if the dynamics of the system can not be neglected"',

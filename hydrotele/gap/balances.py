@@ -28,19 +28,19 @@ from hydrotele.estimate.reduced_model import (
 from hydrotele.hydraulics.circuit import (
     SLOT_COUNT,
     Slot,
+    actuator_end_stop_force,
     actuator_friction,
-    actuator_stop,
-    axis_opening,
+    advance_pump_flow_fraction,
+    axis_valve_opening,
     chamber_flows,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     delivered_flow_fraction,
     demanded_flow_fraction,
-    pump_response,
 )
-from hydrotele.hydraulics.laws import air_compliance, air_softening_factor, port_flow, spool_step
+from hydrotele.hydraulics.laws import air_compliance, air_softening_factor, relief_and_makeup_flow, spool_step
 from hydrotele.hydraulics.parameters import PUMP_OFFSET, actuator_order, actuator_parameters
-from hydrotele.hydraulics.pump import load_force, load_pressure_step
+from hydrotele.hydraulics.pump import load_cylinder_force, load_pressure_step
 from hydrotele.hydraulics.supply import drawn_flow, max_supply_pressure
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
@@ -48,8 +48,8 @@ from hydrotele.kinematics.linkages import LoopOpenError
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import fit_clock
-from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
-from hydrotele.machine.signals import default_unit, parse_channel
+from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.machine.signals import default_channel_unit, parse_channel
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
     BIAS,
@@ -114,7 +114,7 @@ def load_forces(model, space, motion):
                 change += m.bar[bar, LENGTH_BIAS] + np.sum(m.bar[bar, LENGTH_ROW:] * m.joint[DRIFT])
             forces[k, i] += actuator_friction(model.user, i * SLOT_COUNT, velocity)
             at = space.drive[X, i] if model.gear[i] < 0 else load_position(model, space, i)
-            forces[k, i] -= actuator_stop(model.user, i * SLOT_COUNT, at, velocity)[0]
+            forces[k, i] -= actuator_end_stop_force(model.user, i * SLOT_COUNT, at, velocity)[0]
             if model.gear[i] >= 0:
                 forces[k, i] += model.transmission[model.gear[i], 0] * change
     return forces
@@ -144,10 +144,10 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
     tank, hose, beta = user[_TANK], user[_HOSE], user[_BETA]
     for k in range(len(spool)):
         p_head, p_rod = head[0, k], rod[0, k]
-        opening = axis_opening(user, 0, spool[k])
+        opening = axis_valve_opening(user, 0, spool[k])
         q_head, q_rod, _, _ = chamber_flows(user, 0, opening, supply[k], p_head, p_rod)
-        r_head, _ = port_flow(p_head, user[_PORT], user[_KR], tank, user[_KM])
-        r_rod, _ = port_flow(p_rod, user[_PORT], user[_KR], tank, user[_KM])
+        r_head, _ = relief_and_makeup_flow(p_head, user[_PORT], user[_KR], tank, user[_KM])
+        r_rod, _ = relief_and_makeup_flow(p_rod, user[_PORT], user[_KR], tank, user[_KM])
         leak = user[_LEAK] * (p_head - p_rod)
         soft = 1.0 / beta + air_compliance(p_head, user[_BUBBLES])
         stored_head = (volumes[0, k] * soft + hose) * head[1, k]
@@ -167,10 +167,10 @@ def _settle(user, spools, pressures, period, act, ports):
     for i in range(count):
         act[4 * i] = spools[i]
         act[4 * i + 2], act[4 * i + 3] = pressures[i]
-    compute_ports(user, act, act, ports, 0, count, 0.0, act)
+    compute_inlet_conditions(user, act, act, ports, 0, count, 0.0, act)
     if user[_LAG] > 0.0:
         wanted = demanded_flow_fraction(user, 0, count, ports)
-        act[at] = pump_response(user, 0, wanted, act[at], period) if period > 0.0 else wanted
+        act[at] = advance_pump_flow_fraction(user, 0, wanted, act[at], period) if period > 0.0 else wanted
 
 
 @compiled
@@ -274,7 +274,7 @@ def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping
     clock, _ = fit_clock(log.time, log.source)
     rows = int(clock.tick[-1]) + 1
     time = clock.start + clock.period * np.arange(rows)
-    stated = None if sensors is None else get_sensors(machine, sensors)
+    stated = None if sensors is None else get_sensor_set(machine, sensors)
     command, reading, found, smoothed = {}, {}, {}, {}
     told = noise or {}
     for k, (name, values) in enumerate(log.columns.items()):
@@ -290,13 +290,13 @@ def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping
         error = machine.sensor_errors.get(name, SensorError())
         on_clock = _corrected(on_clock, error, time)
         known = on_clock[np.isfinite(on_clock)]
-        sigma = told.get(name) or noise_rms(machine, stated, name)
+        sigma = told.get(name) or reading_noise_rms(machine, stated, name)
         sigma = sigma / error.scale or None
         if len(known) < _LEAST_READINGS or (sigma is None and np.ptp(known) == 0.0):
             continue
-        motion = smoothing.smooth(on_clock[:, None], clock.period, sigma)
+        motion = smoothing.smooth_and_differentiate(on_clock[:, None], clock.period, sigma)
         best = np.stack([motion.value, motion.rate, motion.acceleration])[None, :, :, 0]
-        draws = smoothing.sample_errors(motion, DRAWS, k)[..., 0]
+        draws = smoothing.sample_smoothing_errors(motion, DRAWS, k)[..., 0]
         reading[name], found[name] = on_clock, float(motion.noise[0])
         smoothed[name] = np.concatenate([best, best + draws])
     return Signals(time, clock.period, command, reading, found, smoothed)
@@ -533,7 +533,7 @@ def _signals(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -
     columns = {f"command.{axis}": v for axis, v in zip(data.axes, run.command.T, strict=True)}
     columns |= dict(zip(data.channels, run.reading.T, strict=True))
     time = run.start + run.period * np.arange(len(run.command))
-    log = Log(time, columns, {c: default_unit(c, columns) for c in columns}, source=run.name)
+    log = Log(time, columns, {c: default_channel_unit(c, columns) for c in columns}, source=run.name)
     each = noise if run.readings_per_mean is None else noise / np.sqrt(run.readings_per_mean)
     known = dict(zip(data.channels, each.tolist(), strict=True))
     return read_signals(machine, log, data.sensors, known)
@@ -638,7 +638,7 @@ def _push(machine: Machine, signals: Signals, name: str) -> np.ndarray | None:
     if not signals.has(*channels):
         return None
     head, rod = (signals.smoothed[c][:, 0] for c in channels)
-    area_head, area_rod = axis.hydraulic_drive.areas
+    area_head, area_rod = axis.hydraulic_drive.effective_areas
     return area_head * head - area_rod * rod
 
 
@@ -654,7 +654,7 @@ def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.
         pressure = 0.0
         for row in range(1, len(velocity)):
             pressure = load_pressure_step(user, PUMP_OFFSET, pressure, velocity[row], period)
-            forces[d, row] = load_force(user, PUMP_OFFSET, pressure)
+            forces[d, row] = load_cylinder_force(user, PUMP_OFFSET, pressure)
         way = np.tanh(velocity / smooth)
         forces[d] += load.friction * forces[d] * way + load.return_force * np.minimum(way, 0.0)
     return forces
@@ -679,7 +679,7 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
             [
                 chamber_residuals(
                     numbers[name], spool, supply[d, 0], head[d, :2].copy(), rod[d, :2].copy(),
-                    np.stack(drive.volumes(displacement[d])), velocity[d],
+                    np.stack(drive.chamber_volumes(displacement[d])), velocity[d],
                 )
                 for d in range(len(velocity))
             ]
@@ -687,7 +687,7 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
         for side, law in enumerate(("flow_head", "flow_rod")):
             residual, noise = _in_band(lacks[:, side], signals.period)
             yield law, name, _balance(signals.time, residual, noise, "m^3/s")
-        expected = velocity - lacks[:, 0] / drive.areas[0]
+        expected = velocity - lacks[:, 0] / drive.effective_areas[0]
         lags = window_lags(expected, velocity, signals.period)
         if lags is not None:
             yield "timing", name, _balance(signals.time, *lags, "s")

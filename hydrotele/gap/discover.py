@@ -158,7 +158,7 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
         facts = machine.axes[axis]
         if facts.is_hydraulic:
             head, rod = act[:, 4 * i + 2], act[:, 4 * i + 3]
-            areas = facts.hydraulic_drive.areas
+            areas = facts.hydraulic_drive.effective_areas
             own |= {"pressure_head": head, "pressure_rod": rod,
                     "force": areas[0] * head - areas[1] * rod}  # fmt: skip
             own["pump_speed" if facts.pump else "spool"] = act[:, 4 * i]

@@ -109,13 +109,13 @@ def _speed(machine: Machine, name: str, at: float, width: float) -> float:
     """Speed of a joint [rad/s] or [m/s] that half the flow of its valve or of the pump gives."""
     axis = machine.axes[name]
     if axis.pump:
-        return _SHARE * axis.pump.rated_flow / axis.hydraulic_drive.areas[0]
+        return _SHARE * axis.pump.rated_flow / axis.hydraulic_drive.effective_areas[0]
     if axis.valve is None or machine.supply is None:
         return width / _FORCE_PASS
     drop = 0.5 * (machine.supply.relief_pressure - machine.supply.tank_pressure)
     flow = axis.valve.rated_flow * math.sqrt(drop / axis.valve.rated_pressure_drop)
     arm = max(abs(float(axis_linkage(machine, name).rate(at))), 1e-3)
-    return _SHARE * min(flow, machine.supply.pump_flow) / (axis.hydraulic_drive.areas[0] * arm)
+    return _SHARE * min(flow, machine.supply.pump_flow) / (axis.hydraulic_drive.effective_areas[0] * arm)
 
 
 def _clear(machine: Machine, home: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:

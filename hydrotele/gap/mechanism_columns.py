@@ -24,7 +24,7 @@ from hydrotele.identify.equations import (
     low_pass_forces,
     predict_forces,
 )
-from hydrotele.identify.mechanism import Mechanism, convert_coordinates
+from hydrotele.identify.mechanism import Mechanism, convert_to_given_joints
 from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.record import (
     IdentificationRecord,
@@ -169,7 +169,7 @@ def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -
     bands, moves = [], []
     for whole in records:
         many = max(1, int(_RESOLVED / whole.period))
-        record = convert_coordinates(_averaged(whole, many), mechanism.setup)
+        record = convert_to_given_joints(_averaged(whole, many), mechanism.setup)
         found = estimate_resolution(record.position, record.period, record.position_noise)
         bands.append(min(0.5 * found.bandwidth, _WIDEST, 0.2 / record.period))
         bands[-1] = max(bands[-1], _SLOWEST / (len(record.force) * record.period))
@@ -258,7 +258,7 @@ def _run_columns(
 ):  # fmt: skip
     """Names, matrix, measured, modelled, time, doubt, states, spacing of one run."""
     how = Processing("zero_phase", band=band)
-    record = convert_coordinates(raw, setup)
+    record = convert_to_given_joints(raw, setup)
     found = estimate_resolution(record.position, record.period, record.position_noise)
     plain = estimate_resolution(raw.position, raw.period, raw.position_noise)
     lengths = compute_joint_motion(raw.position, raw.period, plain, how)
@@ -311,7 +311,7 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
 def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
-    found = setup.project(*motion)
+    found = setup.project_motion_on_drives(*motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
     base = setup.compute_regressor(found).matrix @ value + np.einsum("nkv,nv->nk", found.joint_projection, passive)
     change = np.gradient(base, period, axis=0)
@@ -345,7 +345,7 @@ def _dry_friction(setup: RegressorSetup, motion: np.ndarray, band: float, period
         {one.location for one in setup.friction_terms if "coulomb" in one.nominal},
     )
     drives = [drive for drive in chain.drives if drive in rubs]
-    found, places = setup.project(*motion), [chain.index(name) for name in drives]
+    found, places = setup.project_motion_on_drives(*motion), [chain.index(name) for name in drives]
     share, rate = found.joint_projection[:, :, places], found.rate[:, places]
     low, _ = design_low_pass(band, period)
     calm = fftconvolve(rate, low[:, None], mode="same", axes=0)
@@ -371,7 +371,7 @@ class _Differences:
     def columns(self, sizes) -> tuple[list[str], np.ndarray]:
         """Names, and (n, k, m)."""
         chain = self.setup.chain
-        found = self.setup.project(*self.motion)
+        found = self.setup.project_motion_on_drives(*self.motion)
         here = [chain.index(name) for name in self.axes]
         moves = np.linalg.solve(found.joint_projection[:, :, here], found.joint_projection)  # q_v per measured joint
         given = [chain.index(name) for name in self.setup.given_joints]

@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
-from hydrotele.identify.estimation import autoregression, compute_weights, estimate_error_variances
+from hydrotele.identify.estimation import compute_weights, estimate_error_variances, fit_autoregression
 from hydrotele.identify.mechanism import Mechanism
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
@@ -384,9 +384,9 @@ def row_weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
 def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:
     """Autoregression (q, k) of the longest run, long enough for all."""
     longest = int(np.argmax(np.diff(starts)))
-    found = [autoregression(rest[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    found = [fit_autoregression(rest[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
     order = len(found[longest])
-    fixed = [autoregression(rest[a:b], order) for a, b in zip(starts[:-1], starts[1:], strict=True)
+    fixed = [fit_autoregression(rest[a:b], order) for a, b in zip(starts[:-1], starts[1:], strict=True)
              if b - a > 4 * order]  # fmt: skip
     return np.mean(fixed, axis=0)
 

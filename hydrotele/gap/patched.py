@@ -26,7 +26,7 @@ from hydrotele.gap.result import (
 from hydrotele.identify.mechanism import ColumnMapping
 from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
-from hydrotele.multibody.chain import Chain, body_inertia
+from hydrotele.multibody.chain import Chain, body_inertial_parameters
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
 EFFECTS_FILE = "effects.yaml"
@@ -270,7 +270,7 @@ def _set_first(joint: Any, field_name: str, value: float) -> None:
 
 def _set_body(body: Any, model: mujoco.MjModel, numbers: Mapping[str, float]) -> None:
     """Mass, centre of mass and inertia from parameters about the body's origin."""
-    given = dict(zip(BODY_PARAMETERS, body_inertia(model, model.body(body.name).id), strict=True))
+    given = dict(zip(BODY_PARAMETERS, body_inertial_parameters(model, model.body(body.name).id), strict=True))
     ten = np.array([(given | dict(numbers))[kind] for kind in BODY_PARAMETERS])
     mass = max(ten[0], 1e-6)
     centre = ten[1:4] / mass

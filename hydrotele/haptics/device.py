@@ -379,7 +379,7 @@ class Haption:
                 ("TimeStep", period), ("BaseFrame", frame), ("ObservationFrame", frame),
                 ("CommandType", _IMPEDANCE), ("PowerOn", 1),
             ):  # fmt: skip
-                self._check_code(getattr(api, f"virtSet{name}")(self._device, value))
+                self._check_return_code(getattr(api, f"virtSet{name}")(self._device, value))
             self._centre, self._inverse_start_rotation = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
             begun = self.read()
         except OSError as error:
@@ -397,10 +397,10 @@ class Haption:
             OSError: the device does not answer.
         """
         api, device = self._api, self._device
-        self._check_code(api.virtGetPosition(device, self._pose_buffer))
+        self._check_return_code(api.virtGetPosition(device, self._pose_buffer))
         seven, buttons = np.array(self._pose_buffer), 0
         for bit, number in enumerate(_BUTTON_NUMBERS):
-            self._check_code(api.virtGetButton(device, number, ctypes.byref(self._pressed)))
+            self._check_return_code(api.virtGetButton(device, number, ctypes.byref(self._pressed)))
             buttons |= (self._pressed.value != 0) << bit
         x, y, z, w = seven[3:]  # the vendor's order: scalar last
         turn = np.array([w, *(_VIRTUOSE_AXIS_SIGNS * (x, y, z))])
@@ -420,7 +420,7 @@ class Haption:
             _VIRTUOSE_AXIS_SIGNS * wrench[:3],
             _VIRTUOSE_AXIS_SIGNS * wrench[3:],
         )
-        self._check_code(self._api.virtSetForce(self._device, self._wrench_buffer))
+        self._check_return_code(self._api.virtSetForce(self._device, self._wrench_buffer))
 
     def close(self) -> None:
         """Switch the force off and close the device."""
@@ -429,7 +429,7 @@ class Haption:
         self._api.virtSetPowerOn(self._device, 0)
         self._api.virtClose(self._device)
 
-    def _check_code(self, code: int) -> None:
+    def _check_return_code(self, code: int) -> None:
         if code != 0:
             raise OSError(self._error_message(self._device))
 

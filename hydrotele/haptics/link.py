@@ -46,20 +46,20 @@ from hydrotele.haptics.packets import (
     WRENCH_WORDS,
     make_packet,
 )
-from hydrotele.haptics.timing import request_priority, summarise_durations
+from hydrotele.haptics.timing import request_realtime_priority, summarise_durations
 from hydrotele.teleop.axis_table import (
     COORDINATE,
     DEADBAND,
     HANDLE_RANGE,
     flat_view,
-    make_flat_state,
+    make_contiguous_state,
 )
 from hydrotele.teleop.master import (
     REFLECTION_KINDS,
     MasterParameters,
     MasterState,
     step_master,
-    unpack_master,
+    unpack_master_parameters,
     unpack_master_state,
 )
 
@@ -151,13 +151,13 @@ _MONOTONIC = clock.CLOCK_MONOTONIC
 
 
 @compiled
-def _read_clock(two):
-    """Return the time of `time.monotonic_ns` [ns]; `two` (2,) is work space.
+def _read_clock(timespec):
+    """Return the time of `time.monotonic_ns` [ns]; `timespec` (2,) is work space.
 
     The system call also makes the compiler read shared memory again instead of using cached values.
     """
-    _gettime(np.int32(_MONOTONIC), two.ctypes.data)
-    return two[0] * 1_000_000_000 + two[1]
+    _gettime(np.int32(_MONOTONIC), timespec.ctypes.data)
+    return timespec[0] * 1_000_000_000 + timespec[1]
 
 
 @compiled
@@ -190,23 +190,23 @@ def scale_pose(position, quaternion, scale, rotation_scale, out):
 
 
 @compiled
-def answer_pose(line, box, now, two):
+def answer_pose_packet(buffers, mailbox, now, timespec):
     """Check a received pose packet, count it, and compute the wrench packet that answers it.
 
     The wrench follows from the joystick's control law and the machine's latest packet.
 
     Args:
-        line: LinkBuffers with the received `pose`. `reply`, `count` and `ramp` are written.
-        box: Mailbox; the handle's part and `state` are written.
+        buffers: LinkBuffers with the received `pose`. `reply`, `count` and `ramp` are written.
+        mailbox: Mailbox; the handle's part and `state` are written.
         now: arrival time, scalar [ns].
-        two: (2,) work space of the clock.
+        timespec: (2,) work space of the clock.
 
     Returns:
         Whether `reply` must be sent; false for a malformed or late packet.
 
     Source: `teleop.master`; this module.
     """
-    pose, real, count = line.pose, line.pose_real, line.count
+    pose, real, count = buffers.pose, buffers.pose_real, buffers.count
     if pose[MAGIC] != POSE_MAGIC or not real[PERIOD] > 0.0:
         count[MALFORMED] += 1
         return False
@@ -218,14 +218,14 @@ def answer_pose(line, box, now, two):
             -1,
         )
         count[SERVER_STARTS] += 1
-        line.ramp[FORCE_GAIN] = 0.0
+        buffers.ramp[FORCE_GAIN] = 0.0
     if pose[SEQUENCE] <= count[LAST_POSE]:
         count[LATE] += 1
         return False
     first = count[LAST_POSE] < 0
     if not first:
         count[LOST] += pose[SEQUENCE] - count[LAST_POSE] - 1
-        line.intervals[count[INTERVALS] % len(line.intervals)] = now - count[POSE_ARRIVAL_TIME]
+        buffers.intervals[count[INTERVALS] % len(buffers.intervals)] = now - count[POSE_ARRIVAL_TIME]
         count[INTERVALS] += 1
     nominal = real[PERIOD]
     period = 1e-9 * (pose[SENT] - count[POSE_SENT_TIME])
@@ -237,21 +237,21 @@ def answer_pose(line, box, now, two):
     )
     count[RECEIVED] += 1
     if pose[LAST_ACCEPTED] > count[LAST_ACKNOWLEDGED]:
-        line.round_trip_times[count[ROUNDS] % len(line.round_trip_times)] = (
-            now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
+        buffers.round_trip_times[count[ROUNDS] % len(buffers.round_trip_times)] = (
+            now - buffers.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
         )
         count[ROUNDS] += 1
         count[LAST_ACKNOWLEDGED] = pose[LAST_ACCEPTED]
-    _compute_reflection(line, box, now, two, first, period)
-    reply, out = line.reply, line.reply_real
+    _compute_reflected_force(buffers, mailbox, now, timespec, first, period)
+    reply, out = buffers.reply, buffers.reply_real
     reply[MAGIC], reply[SESSION], reply[SEQUENCE] = WRENCH_MAGIC, pose[SESSION], count[NEXT_WRENCH]
     reply[ANSWERED_POSE] = pose[SEQUENCE]
-    reply[FORCES_ON] = 1 if line.ramp[FORCE_GAIN] > 0.0 else 0
-    m = unpack_master_state(box.state)
+    reply[FORCES_ON] = 1 if buffers.ramp[FORCE_GAIN] > 0.0 else 0
+    m = unpack_master_state(mailbox.state)
     for part in range(2):
         size = 0.0
         for i in range(3 * part, 3 * part + 3):
-            out[WRENCH + i] = line.ramp[FORCE_GAIN] * m.push[i]
+            out[WRENCH + i] = buffers.ramp[FORCE_GAIN] * m.push[i]
             size += out[WRENCH + i] ** 2
         size, most = np.sqrt(size), real[MAX_WRENCH + part]
         share = most / size if size > most else 1.0
@@ -262,7 +262,7 @@ def answer_pose(line, box, now, two):
 
 
 @compiled
-def _compute_reflection(line, box, now, two, first, period):
+def _compute_reflected_force(line, box, now, two, first, period):
     """Write the handle's pose into the mailbox and compute the force on the handle.
 
     The force is stored in `box.state`. Without data from the machine or a valid pose, its factor
@@ -296,36 +296,36 @@ def _compute_reflection(line, box, now, two, first, period):
     able = np.isfinite(box.handle[0])
     line.ramp[FORCE_GAIN] = min(1.0, line.ramp[FORCE_GAIN] + period / FORCE_RAMP_TIME) if alive and able else 0.0
     fresh = share if age < REFLECTION_TIMEOUT else 0.0
-    step_master(unpack_master(box.parameters), box.handle[:7], packet, fresh, period, first, state)
+    step_master(unpack_master_parameters(box.parameters), box.handle[:7], packet, fresh, period, first, state)
 
 
 @compiled
-def _answer_poses(handle, line, box):
+def _run_answer_loop(socket_fd, buffers, mailbox):
     """Receive pose packets from a socket and answer each with a wrench until `count[STOP_FLAG]` is set.
 
     While no pose arrives, connection requests are sent to the server.
     """
-    two, count = np.zeros(2, np.int64), line.count
+    two, count = np.zeros(2, np.int64), buffers.count
     size, answer = np.uint64(8 * POSE_WORDS), np.uint64(8 * WRENCH_WORDS)
     while count[STOP_FLAG] == 0:
-        got = _recv(np.int32(handle), line.pose.ctypes.data, size, np.int32(0))
+        got = _recv(np.int32(socket_fd), buffers.pose.ctypes.data, size, np.int32(0))
         now = _read_clock(two)
         if (
             now - max(count[REQUEST_TIME], count[POSE_ARRIVAL_TIME]) > _REQUEST_INTERVAL_NS
         ):  # no server, or client dropped
-            line.reply[:] = 0
-            line.reply[MAGIC], line.reply[SENT] = WRENCH_MAGIC, now
+            buffers.reply[:] = 0
+            buffers.reply[MAGIC], buffers.reply[SENT] = WRENCH_MAGIC, now
             count[REQUEST_TIME] = now
-            _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
+            _send(np.int32(socket_fd), buffers.reply.ctypes.data, answer, np.int32(0))
         if got < 0:
             continue
         if got != 8 * POSE_WORDS:
             count[MALFORMED] += 1
-        elif answer_pose(line, box, now, two):
-            line.reply[SENT] = _read_clock(two)
-            line.sent[line.reply[SEQUENCE] % _MAX_SENT_TIMES] = line.reply[SENT]
-            _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
-            line.answers[count[ANSWERS] % len(line.answers)] = _read_clock(two) - now
+        elif answer_pose_packet(buffers, mailbox, now, two):
+            buffers.reply[SENT] = _read_clock(two)
+            buffers.sent[buffers.reply[SEQUENCE] % _MAX_SENT_TIMES] = buffers.reply[SENT]
+            _send(np.int32(socket_fd), buffers.reply.ctypes.data, answer, np.int32(0))
+            buffers.answers[count[ANSWERS] % len(buffers.answers)] = _read_clock(two) - now
             count[ANSWERS] += 1
 
 
@@ -338,7 +338,7 @@ _MAILBOX_DTYPE = np.dtype(
 
 
 @compiled
-def read_pose(mail, now, pose):
+def read_pose_from_mailbox(mail, now, pose):
     """Read the handle's pose from the mailbox.
 
     Args:
@@ -392,15 +392,15 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
     float64_view(r.share, 1)[0], int64_view(r.stamp, 2)[_MACHINE] = packet_gain, now
     _read_clock(two)
     turn[_MACHINE] += 1
-    there = read_pose(mail, now, pose)
-    engaged = there and (engaged or _is_centred(pose, float64_view(r.dead, 6)))
+    there = read_pose_from_mailbox(mail, now, pose)
+    engaged = there and (engaged or _is_handle_centred(pose, float64_view(r.dead, 6)))
     for i in range(7):
         qpos[i] = pose[i] if engaged else np.nan
     return engaged
 
 
 @compiled
-def _is_centred(pose, dead):
+def _is_handle_centred(pose, dead):
     """Return whether the handle is inside the dead bands `dead` (6,) [m], [rad] of all axes."""
     for i in range(3):
         if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
@@ -455,7 +455,7 @@ class HapticLink:
         if kind not in REFLECTIONS:
             message = f"{kind!r} does not support haptic devices; valid: {', '.join(REFLECTIONS)}"
             raise InputError("pilot.reflection", message)
-        state = make_flat_state(MasterState, [part.shape for part in template])
+        state = make_contiguous_state(MasterState, [part.shape for part in template])
         state.limited[:] = 1.0
         self.mailbox = Mailbox(
             np.zeros(2, np.int64), np.zeros(2, np.int64), np.full(8, np.nan), np.zeros(packet_shape),
@@ -476,7 +476,7 @@ class HapticLink:
         self._mailbox_record = address_record(_MAILBOX_DTYPE, {**arrays, "dead": self._deadbands})
         self._mailbox_record["rows"], self._mailbox_record["columns"] = packet_shape
         self.buffers.count[STOP_FLAG] = 1
-        _answer_poses(self._socket.fileno(), self.buffers, self.mailbox)  # triggers compilation
+        _run_answer_loop(self._socket.fileno(), self.buffers, self.mailbox)  # triggers compilation
         self.buffers.count[STOP_FLAG] = 0
         seconds = int(_RECEIVE_TIMEOUT), round(1e6 * (_RECEIVE_TIMEOUT % 1.0))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _pack_timeval(*seconds))
@@ -484,8 +484,8 @@ class HapticLink:
         self._thread.start()
 
     def _run(self) -> None:
-        self.priority = request_priority(_PRIORITY)
-        _answer_poses(self._socket.fileno(), self.buffers, self.mailbox)
+        self.priority = request_realtime_priority(_PRIORITY)
+        _run_answer_loop(self._socket.fileno(), self.buffers, self.mailbox)
 
     def exchange(self, qpos: np.ndarray, packet: np.ndarray, packet_gain: float, extra: np.ndarray) -> None:
         """Exchange data with the device once per tick: read the pose, send the machine's packet.
@@ -503,7 +503,7 @@ class HapticLink:
     def pose(self) -> HandlePose | None:
         """Return the handle's pose in joystick scale, None while no pose arrives."""
         values = np.empty(8)
-        if not read_pose(self._mailbox_record, clock.monotonic_ns(), values):
+        if not read_pose_from_mailbox(self._mailbox_record, clock.monotonic_ns(), values):
             return None
         return HandlePose(values[:3], values[3:7], int(values[7]))
 

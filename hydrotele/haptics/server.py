@@ -52,8 +52,8 @@ from hydrotele.haptics.packets import (
 )
 from hydrotele.haptics.timing import (
     BUSY_WAIT_TIME,
-    load_of_machine,
-    reduced_jitter,
+    read_load_averages,
+    reduce_timing_jitter,
     summarise_durations,
 )
 
@@ -81,7 +81,7 @@ class ServerSummary(NamedTuple):
         wake_delay: delay of the start of a period, see `summarise_durations`.
         round_trip: time from sending a pose to receiving its answer, see `summarise_durations`.
         priority: whether real-time priority was granted.
-        load: load averages of the computer, see `load_of_machine`.
+        load: load averages of the computer, see `read_load_averages`.
     """
 
     periods: int
@@ -133,7 +133,7 @@ class DeviceSession:
         )
         self._forces_on, self.answered = False, -1
 
-    def update_pose(self, now: int) -> None:
+    def apply_wrench_and_read_pose(self, now: int) -> None:
         """Run one period: check the timeouts, apply the wrench, and write the handle's pose into the packet `pose`.
 
         Args:
@@ -208,7 +208,7 @@ class DeviceSession:
         return "" if 0 <= behind <= self._max_pose_lag else "stale"
 
 
-def run_server(
+def run_device_server(
     device: HapticDevice, address: Address, period: float, should_stop: Callable[[], bool],
     on_open: Callable[[Address], None] = lambda where: None,
 ) -> ServerSummary:  # fmt: skip
@@ -237,19 +237,19 @@ def run_server(
     line.setblocking(False)
     exchange = DeviceSession(device, period, secrets.randbits(62) + 1)
     on_open(line.getsockname())
-    with line, reduced_jitter(_PRIORITY) as priority:
+    with line, reduce_timing_jitter(_PRIORITY) as priority:
         try:
-            wake, trips, periods = _run_periods(line, exchange, period, should_stop)
+            wake, trips, periods = _run_server_periods(line, exchange, period, should_stop)
         finally:
             with contextlib.suppress(OSError):  # a device that no longer answers applies no force either
                 device.write(np.zeros(6), False)
     return ServerSummary(
         periods, exchange.missed, exchange.unanswered, exchange.rejected_packets, exchange.watchdog_trips,
-        summarise_durations(wake), summarise_durations(trips), priority, load_of_machine(),
+        summarise_durations(wake), summarise_durations(trips), priority, read_load_averages(),
     )  # fmt: skip
 
 
-def _run_periods(
+def _run_server_periods(
     line: socket.socket, exchange: DeviceSession, period: float, over: Callable[[], bool]
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Run one period after the other; return start delays [ns], answer times [ns], period count."""
@@ -269,7 +269,7 @@ def _run_periods(
             answers += _receive_packet(line, exchange, view, trips[answers : answers + 1], now)
         began = now()
         wake[count % _MAX_SAMPLES] = began - due
-        exchange.update_pose(began)
+        exchange.apply_wrench_and_read_pose(began)
         count += 1
         if exchange.client:
             with contextlib.suppress(OSError):  # no listener: the watchdog handles it

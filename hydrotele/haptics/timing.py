@@ -80,7 +80,7 @@ class RealTimePacer:
 
         Args:
             max_ticks: maximum number of ticks whose delay is recorded.
-            priority_level: real-time priority from the first tick on, see `reduced_jitter`; 0 requests none.
+            priority_level: real-time priority from the first tick on, see `reduce_timing_jitter`; 0 requests none.
             max_delay: delay after which simulated time is set back [s].
             now: function that returns the time [ns].
             sleep: function that waits for a time [s].
@@ -111,7 +111,7 @@ class RealTimePacer:
         due, now = round(simulated * 1e9), self._now()
         if self._start is None:
             if self._level:
-                self.priority = self._priority_stack.enter_context(reduced_jitter(self._level))
+                self.priority = self._priority_stack.enter_context(reduce_timing_jitter(self._level))
                 now = self._now()
             self._start = now - due
         early = self._start + due - now
@@ -142,7 +142,7 @@ class RealTimePacer:
         return late[late > 0]
 
 
-def measure_idle_deadlines(
+def measure_missed_deadlines(
     seconds: float, rate: float, level: int = 0, now: Callable[[], int] = clock.monotonic_ns,
     sleep: Callable[[float], None] = clock.sleep,
 ) -> dict:  # fmt: skip
@@ -151,7 +151,7 @@ def measure_idle_deadlines(
     Args:
         seconds: duration [s].
         rate: rate of the deadlines [Hz].
-        level: real-time priority, see `reduced_jitter`.
+        level: real-time priority, see `reduce_timing_jitter`.
         now: function that returns the time [ns].
         sleep: function that waits for a time [s].
 
@@ -189,7 +189,7 @@ def read_steal_time(stat: Path = _STAT_FILE) -> float | None:
         return None
 
 
-def load_of_machine() -> list[float] | None:
+def read_load_averages() -> list[float] | None:
     """Return the computer's load averages over 1, 5 and 15 minutes, None if unknown."""
     try:
         return [round(v, 2) for v in os.getloadavg()]
@@ -197,7 +197,7 @@ def load_of_machine() -> list[float] | None:
         return None
 
 
-def request_priority(level: int) -> bool:
+def request_realtime_priority(level: int) -> bool:
     """Request real-time priority (first-in first-out scheduling) for the calling thread.
 
     Args:
@@ -214,14 +214,14 @@ def request_priority(level: int) -> bool:
 
 
 @contextlib.contextmanager
-def reduced_jitter(level: int) -> Iterator[bool]:
+def reduce_timing_jitter(level: int) -> Iterator[bool]:
     """Reduce timing jitter: no garbage collection, exact sleeps, small pages, real-time priority.
 
     Priority and a short processor wake-up time are set only where the system permits them.
     Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
 
     Args:
-        level: see `request_priority`; 0 requests none.
+        level: see `request_realtime_priority`; 0 requests none.
 
     Yields:
         Whether priority was granted.
@@ -233,7 +233,7 @@ def reduced_jitter(level: int) -> Iterator[bool]:
     gc.collect()
     gc.freeze()
     gc.disable()
-    given = level > 0 and request_priority(level)
+    given = level > 0 and request_realtime_priority(level)
     awake = contextlib.ExitStack()
     with contextlib.suppress(OSError):  # not available, or not permitted
         awake.enter_context(_WAKE_LATENCY_FILE.open("r+b", buffering=0)).write(bytes(4))

@@ -19,10 +19,10 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 
 import math
 
-from hydrotele.core.compiled import allocation_free, inlined
-from hydrotele.hydraulics.laws import friction_force, friction_slope, stop_force
+from hydrotele.core.compiled import compile_inlined, compile_without_allocation
+from hydrotele.hydraulics.laws import end_stop_force, friction_force, friction_slope
 from hydrotele.hydraulics.parameters import PUMP_OFFSET, ActuatorKind, Slot
-from hydrotele.hydraulics.pump import load_force, pump_piston_friction, pump_pressure_rates
+from hydrotele.hydraulics.pump import load_cylinder_force, pump_piston_friction, pump_pressure_rates
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _VH, _VR = int(Slot.VOLUME_HEAD), int(Slot.VOLUME_ROD)
@@ -36,7 +36,7 @@ _STOP_STIFFNESS, _STOP_DAMPING = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING
 _PUMPED = float(ActuatorKind.PUMP_DRIVE)
 
 
-@inlined
+@compile_inlined
 def actuator_friction(user, u, velocity):
     """Return the Coulomb, Stribeck and viscous friction force of an actuator at a velocity.
 
@@ -62,7 +62,7 @@ def actuator_friction(user, u, velocity):
     )
 
 
-@allocation_free
+@compile_without_allocation
 def actuator_friction_slope(user, u, velocity):
     """Return the derivative of an actuator's friction force with respect to its velocity.
 
@@ -82,8 +82,8 @@ def actuator_friction_slope(user, u, velocity):
     )  # fmt: skip
 
 
-@allocation_free
-def actuator_stop(user, u, position, velocity):
+@compile_without_allocation
+def actuator_end_stop_force(user, u, position, velocity):
     """Return the force of an actuator's end stops, its stiffness and its damping.
 
     Args:
@@ -100,7 +100,7 @@ def actuator_stop(user, u, position, velocity):
     """
     if user[u + _STOP_STIFFNESS] == 0.0:
         return 0.0, 0.0, 0.0
-    return stop_force(
+    return end_stop_force(
         position,
         velocity,
         user[u + _STOP_LOW],
@@ -110,7 +110,7 @@ def actuator_stop(user, u, position, velocity):
     )
 
 
-@allocation_free
+@compile_without_allocation
 def pump_drive_volumes(user, u, x):
     """Return, for an axis with its own pump, both chamber volumes and the oil taken from the accumulator.
 
@@ -133,7 +133,7 @@ def pump_drive_volumes(user, u, x):
     )
 
 
-@allocation_free
+@compile_without_allocation
 def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
     """Compute the pressure rates of both chambers of an axis with its own pump, and their slopes.
 
@@ -160,7 +160,7 @@ def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
     """Return the net force of an axis with its own pump, after load cylinder and friction.
 
@@ -179,14 +179,14 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
 
     Source: nominal model, "Piston force", with the friction of `pump_piston_friction`.
     """
-    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_force(user, u + PUMP_OFFSET, p_load)
+    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_cylinder_force(user, u + PUMP_OFFSET, p_load)
     seal = (
         user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _AC], user[u + _AV],
     )  # fmt: skip
     return force - pump_piston_friction(user, u + PUMP_OFFSET, seal, v, force + other_force, p_load, dt)
 
 
-@allocation_free
+@compile_without_allocation
 def force_after_friction(user, u, drive_force, other_force, act, velocity, dt):
     """Return the force of an actuator minus its friction, and the friction slope for an implicit step.
 
@@ -217,7 +217,7 @@ _BRISTLE_STIFFNESS, _BRISTLE_DAMPING = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRI
 _MAX_PHASE_SQUARED = 0.5  # largest (w dt)^2 of a drive on its bristles; the stability limit is 4
 
 
-@allocation_free
+@compile_without_allocation
 def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     """Return the dry (Coulomb and Stribeck) friction of a sliding drive, with a discontinuous sign.
 
@@ -243,8 +243,8 @@ def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     return (coulomb + stribeck * math.exp(-ratio * ratio)) * (sign + asymmetry)
 
 
-@allocation_free
-def bristle_step(force, velocity, level, stiffness, dt):
+@compile_without_allocation
+def advance_bristle_force(force, velocity, sliding_friction_force, stiffness, dt):
     """Return the elastic bristle force (presliding friction) after a time at constant velocity.
 
     The exact solution is `F' = g + (F - g) exp(-sigma_0 |v| dt / |g|)`.
@@ -252,7 +252,7 @@ def bristle_step(force, velocity, level, stiffness, dt):
     Args:
         force: F, scalar [N] or [N m].
         velocity: v, scalar [m/s] or [rad/s].
-        level: g, friction in steady sliding (`sliding_friction`), scalar [N] or [N m].
+        sliding_friction_force: g, friction in steady sliding (`sliding_friction`), scalar [N] or [N m].
         stiffness: sigma_0, scalar [N/m] or [N m/rad].
         dt: duration, scalar [s].
 
@@ -261,26 +261,28 @@ def bristle_step(force, velocity, level, stiffness, dt):
 
     Source: Canudas de Wit et al. 1995, Eq. 1, solved for constant velocity.
 
-    >>> round(bristle_step(0.0, 1.0e-3, 1.0e9, 1.0e8, 1.0e-3), 3)
+    >>> round(advance_bristle_force(0.0, 1.0e-3, 1.0e9, 1.0e8, 1.0e-3), 3)
     100.0
-    >>> bristle_step(0.0, -1.0, -5.0, 1.0e9, 1.0)
+    >>> advance_bristle_force(0.0, -1.0, -5.0, 1.0e9, 1.0)
     -5.0
     """
     if velocity == 0.0:
         return force
-    if level == 0.0:
+    if sliding_friction_force == 0.0:
         return 0.0
-    return level + (force - level) * math.exp(-stiffness * abs(velocity) * dt / abs(level))
+    return sliding_friction_force + (force - sliding_friction_force) * math.exp(
+        -stiffness * abs(velocity) * dt / abs(sliding_friction_force)
+    )
 
 
-@allocation_free
+@compile_without_allocation
 def _actuator_sliding_friction(user, u, velocity):
     """Return the dry friction of an actuator that slides at a velocity, see `sliding_friction`."""
     return sliding_friction(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
-@allocation_free
-def _resolved_stiffness(user, u, inertia, dt):
+@compile_without_allocation
+def _limited_bristle_stiffness(user, u, inertia, dt):
     """Return the bristle stiffness of an actuator, limited so that an explicit step is stable.
 
     The limit is 0.5 inertia / dt^2; an inertia or time step of 0 means no limit.
@@ -291,7 +293,7 @@ def _resolved_stiffness(user, u, inertia, dt):
     return stiffness
 
 
-@allocation_free
+@compile_without_allocation
 def bristle_rate(user, u, fraction, velocity, inertia, dt):
     """Return the mean rate, over a time step, of the bristle state of an actuator (presliding friction).
 
@@ -309,18 +311,18 @@ def bristle_rate(user, u, fraction, velocity, inertia, dt):
     Returns:
         Rate, scalar [1/s].
 
-    Source: `bristle_step`.
+    Source: `advance_bristle_force`.
     """
     breakaway = user[u + _FC] + user[u + _FS]
     level, stiffness = (
         _actuator_sliding_friction(user, u, velocity),
-        _resolved_stiffness(user, u, inertia, dt),
+        _limited_bristle_stiffness(user, u, inertia, dt),
     )
-    after = bristle_step(fraction * breakaway, velocity, level, stiffness, dt) / breakaway
+    after = advance_bristle_force(fraction * breakaway, velocity, level, stiffness, dt) / breakaway
     return (after - fraction) / dt
 
 
-@allocation_free
+@compile_without_allocation
 def bristle_friction(user, u, fraction, velocity, inertia, dt):
     """Return the friction of an actuator with presliding (bristle) friction, and its derivatives.
 
@@ -354,10 +356,10 @@ def bristle_friction(user, u, fraction, velocity, inertia, dt):
     force += friction_force(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
     slope = friction_slope(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
     bent = max(0.0, bent)
-    return force, damping * bent + slope, _resolved_stiffness(user, u, inertia, dt) * bent
+    return force, damping * bent + slope, _limited_bristle_stiffness(user, u, inertia, dt) * bent
 
 
-@allocation_free
+@compile_without_allocation
 def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia, dt):
     """Return the friction of an actuator with bristles at the end of an implicit step of a free body.
 

@@ -15,11 +15,11 @@ import math
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free, inlined
+from hydrotele.core.compiled import compile_inlined, compile_without_allocation
 from hydrotele.hydraulics.actuator import (
+    actuator_end_stop_force,
     actuator_friction,
     actuator_friction_slope,
-    actuator_stop,
     bristle_friction,
     force_after_friction,
     pump_drive_force,
@@ -29,31 +29,31 @@ from hydrotele.hydraulics.actuator import (
 from hydrotele.hydraulics.laws import (
     air_compliance,
     air_softening_factor,
-    axis_opening,
+    axis_valve_opening,
     chamber_flows,
-    port_flow,
-    pressure_with_air,
-    pressure_without_air,
+    pressure_with_released_air,
+    pressure_without_released_air,
+    relief_and_makeup_flow,
     spool_step,
 )
 from hydrotele.hydraulics.parameters import PUMP_OFFSET, SLOT_COUNT, ActuatorKind, Slot
 from hydrotele.hydraulics.pump import (
     load_pressure_step,
     pump_flows,
+    pump_speed_after_switching,
     pump_speed_step,
-    speed_after_switching,
 )
 from hydrotele.hydraulics.supply import (
     TERM_FLOW_TIME_CONSTANT,
     add_flow_fractions,
+    advance_pump_flow_fraction,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
+    compute_supply_pressure_derivatives,
     delivered_flow_fraction,
     demanded_flow_fraction,
     pump_flow_fraction,
-    pump_response,
-    supply_coupling,
-    supply_pressure,
+    solve_supply_pressure,
 )
 from hydrotele.terms.law import VARIABLES, DriveState
 from hydrotele.terms.table import (
@@ -64,7 +64,7 @@ from hydrotele.terms.table import (
     FLOW_ROD,
     FLOW_SUPPLY,
     has_term,
-    hysteresis_location,
+    locate_hysteresis_state,
     sum_flow_terms,
     sum_terms,
     update_term_state,
@@ -73,9 +73,10 @@ from hydrotele.terms.table import (
 __all__ = [
     "ACTIVATIONS_PER_AXIS", "MAX_AXES", "NO_EXTRA_STATES", "SCRATCH_SIZE", "SLOT_COUNT", "ActuatorKind", "Slot",
     "actuator_friction",
-    "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_flows_and_force", "chamber_flows",
-    "circuit_scratch", "circuit_supply_pressure", "delivered_flow_fraction", "force_after_friction", "compute_ports",
-    "pressure_rates", "pump_drive_force", "step_circuit", "supply_pressure", "demanded_flow_fraction",
+    "actuator_friction_slope", "actuator_end_stop_force", "axis_valve_opening", "axis_flows_and_force", "chamber_flows",
+    "circuit_scratch", "circuit_supply_pressure", "delivered_flow_fraction", "force_after_friction",
+    "compute_inlet_conditions", "chamber_pressure_rates", "pump_drive_force", "step_circuit", "solve_supply_pressure",
+    "demanded_flow_fraction",
 ]  # fmt: skip
 
 ACTIVATIONS_PER_AXIS = 4
@@ -107,7 +108,7 @@ _TIME, _POSITION, _VELOCITY = (VARIABLES[name] for name in ("time", "position", 
 _COMMAND, _SUPPLY, _FORCE = (VARIABLES[n] for n in ("command", "pressure_supply", "force"))
 
 
-@inlined
+@compile_inlined
 def _chamber_stiffness(user, u, x, p_head, p_rod):
     """Return the pressure rise per added oil volume of the head and the rod chamber [Pa/m^3].
 
@@ -126,8 +127,8 @@ def _chamber_stiffness(user, u, x, p_head, p_rod):
     return beta / (volume_head + hose), beta / (volume_rod + hose)
 
 
-@inlined
-def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
+@compile_inlined
+def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
     """Return the pressure rates of both chambers of an axis, and their slopes.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`
@@ -162,15 +163,15 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
     tank, makeup_gain = user[u + _TANK], user[u + _KM]
-    r_head, k_head = port_flow(p_head, port, relief_gain, tank, makeup_gain)
-    r_rod, k_rod = port_flow(p_rod, port, relief_gain, tank, makeup_gain)
+    r_head, k_head = relief_and_makeup_flow(p_head, port, relief_gain, tank, makeup_gain)
+    r_rod, k_rod = relief_and_makeup_flow(p_rod, port, relief_gain, tank, makeup_gain)
     head, rod = _chamber_stiffness(user, u, x, p_head, p_rod)
     rate_head = head * (q_head - user[u + _AH] * v - leak + r_head + added[0])
     rate_rod = rod * (q_rod + user[u + _AR] * v + leak + r_rod + added[1])
     if k_head == 0.0:
-        _, k_head = port_flow(p_head + ahead * rate_head, port, relief_gain, tank, makeup_gain)
+        _, k_head = relief_and_makeup_flow(p_head + ahead * rate_head, port, relief_gain, tank, makeup_gain)
     if k_rod == 0.0:
-        _, k_rod = port_flow(p_rod + ahead * rate_rod, port, relief_gain, tank, makeup_gain)
+        _, k_rod = relief_and_makeup_flow(p_rod + ahead * rate_rod, port, relief_gain, tank, makeup_gain)
     return (
         rate_head,
         rate_rod,
@@ -179,7 +180,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     )
 
 
-@allocation_free
+@compile_without_allocation
 def _term_flows(terms, i, user, time, x, oil, supply, drives):
     """Return the flows that a machine's terms (additional laws) add to the chambers of axis i.
 
@@ -198,8 +199,8 @@ def _term_flows(terms, i, user, time, x, oil, supply, drives):
     return sum_flow_terms(terms, i, s, drives)
 
 
-@allocation_free
-def _term_delivery(user, first, drives, terms, time, supply, dt):
+@compile_without_allocation
+def _term_flow_fraction(user, first, drives, terms, time, supply, dt):
     """Return the flow that terms add to the supply at the end of a step, per maximum pump flow [1].
 
     It follows the terms' values at the start of the step with a first-order lag.
@@ -221,13 +222,13 @@ def _term_delivery(user, first, drives, terms, time, supply, dt):
     return wanted + (act[at] - wanted) * math.exp(-dt / TERM_FLOW_TIME_CONSTANT)
 
 
-@allocation_free
+@compile_without_allocation
 def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_states):
     """Advance spools (or pump speeds) and chamber pressures of all hydraulic axes by one time step.
 
     Spools follow their exact exponential. Pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
-    except for the supply, which couples all fed chambers (`supply_coupling`, solved by the
+    except for the supply, which couples all fed chambers (`compute_supply_pressure_derivatives`, solved by the
     Sherman-Morrison formula). The supply pressure is solved in both stages. Below atmosphere the
     method integrates the pressure P without released air (`laws.pressure_without_air`), which is
     linear in the missing oil volume. A pump with a time constant follows the mean of the flow
@@ -267,26 +268,26 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         act_dot[a], act_dot[a + 1] = spool_step(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
-    compute_ports(user, act, act, scratch, first, count, 0.0, act_dot)
+    compute_inlet_conditions(user, act, act, scratch, first, count, 0.0, act_dot)
     held, share, begun, more_delivered = 1.0, 1.0, 0.0, 0.0
     if extra_states >= 0:
         held = delivered_flow_fraction(user, first, act)
     p_start = circuit_supply_pressure(user, first, count, scratch, held)
     if extra_states >= 0:
         begun = demanded_flow_fraction(user, first, count, scratch)
-        more_delivered = _term_delivery(user, first, drives, terms, time, p_start, dt)
-        share = pump_response(user, first, begun, pump_flow_fraction(user, first, act), dt)
+        more_delivered = _term_flow_fraction(user, first, drives, terms, time, p_start, dt)
+        share = advance_pump_flow_fraction(user, first, begun, pump_flow_fraction(user, first, act), dt)
         share = add_flow_fractions(share, more_delivered)
     for i in range(count):
         u, a = (first + i) * SLOT_COUNT, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
         if user[u + _KIND] == _PUMPED:
-            scratch[a + 3] = speed_after_switching(act[a], act_dot[a])
+            scratch[a + 3] = pump_speed_after_switching(act[a], act_dot[a])
         more = _NO_FLOWS
         if len(terms) > 0:
             oil = (act[a], act[a + 1], act[a + 2], act[a + 3])
             more = _term_flows(terms, first + i, user, time, x, oil, p_start, drives)
-        head, rod, j_head, j_rod = pressure_rates(
+        head, rod, j_head, j_rod = chamber_pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
         f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
@@ -295,22 +296,22 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         scratch[f] = 1.0 / (1.0 - gamma_h * (scratch[k] * j_head))
         scratch[f + 1] = 1.0 / (1.0 - gamma_h * (scratch[k + 1] * j_rod))
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
-    coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTOR_OFFSET:])
+    coupled = compute_supply_pressure_derivatives(user, first, count, scratch, p_start, scratch[_FACTOR_OFFSET:])
     if coupled:
-        _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
-        _apply_coupling(count, act_dot, scratch)
+        _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
+        _apply_supply_coupling(count, act_dot, scratch)
     for i in range(count):
         u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
         scratch[k], scratch[k + 1] = act_dot[a + 2], act_dot[a + 3]
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], act_dot[a + 2], dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], act_dot[a + 3], dt)
-    compute_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
+    compute_inlet_conditions(user, act, act_dot, scratch, first, count, dt, act_dot)
     p_end = circuit_supply_pressure(user, first, count, scratch, share)
     if extra_states >= 0:
         if user[first * SLOT_COUNT + _LAG] > 0.0:
             at = int(user[first * SLOT_COUNT + _DELIVERY])
             wanted = 0.5 * (begun + demanded_flow_fraction(user, first, count, scratch))
-            act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
+            act_dot[at] = (advance_pump_flow_fraction(user, first, wanted, act[at], dt) - act[at]) / dt
         if user[first * SLOT_COUNT + _ADDED] > 0.0:
             at = int(user[first * SLOT_COUNT + _ADDED])
             act_dot[at] = (more_delivered - act[at]) / dt
@@ -322,7 +323,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         if len(terms) > 0:
             oil = (act_dot[a], act_dot[a + 1], p_head, p_rod)
             more = _term_flows(terms, first + i, user, time + dt, x, oil, p_end, drives)
-        head, rod, _, _ = pressure_rates(
+        head, rod, _, _ = chamber_pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
         f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
@@ -331,7 +332,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
     if coupled:
-        _apply_coupling(count, act_dot, scratch)
+        _apply_supply_coupling(count, act_dot, scratch)
     for i in range(count):
         u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
         head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
@@ -348,8 +349,8 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
     return p_start, p_end
 
 
-@allocation_free
-def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
+@compile_without_allocation
+def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
     """Write the rates of the internal states of terms with hysteresis over a step.
 
     It must be called after the rates of all other activations are written.
@@ -372,7 +373,7 @@ def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
     """
     act, count = drives.act, drives.count
     for term in range(int(terms[COUNT_INDEX])):
-        place, i, k = hysteresis_location(terms, term)
+        place, i, k = locate_hysteresis_state(terms, term)
         if not (4 * count <= place < len(act_dot) and 0 <= i < len(drives.velocity)):
             continue
         a = 4 * i
@@ -396,7 +397,7 @@ def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
         act_dot[place] = (update_term_state(terms, term, value, act[place]) - act[place]) / dt
 
 
-@allocation_free
+@compile_without_allocation
 def _relief_limited_rate(margin, rate, relief_rate, dt):
     """Return the mean pressure rate over a step in which a port relief valve opens [Pa/s].
 
@@ -414,7 +415,7 @@ def _relief_limited_rate(margin, rate, relief_rate, dt):
     return rate if turns <= 0.0 else (margin - beyond * math.expm1(-turns) / turns) / dt
 
 
-@inlined
+@compile_inlined
 def _rate_with_air(user, u, pressure, rate, dt):
     """Convert a mean pressure rate of oil without released air to that with released air [Pa/s].
 
@@ -424,11 +425,11 @@ def _rate_with_air(user, u, pressure, rate, dt):
     release, onset = user[u + _AIR], user[u + _ONSET]
     if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
         return rate
-    oil = pressure_without_air(pressure, release, onset)
-    return (pressure_with_air(oil + dt * rate, release, onset) - pressure) / dt
+    oil = pressure_without_released_air(pressure, release, onset)
+    return (pressure_with_released_air(oil + dt * rate, release, onset) - pressure) / dt
 
 
-@inlined
+@compile_inlined
 def _predicted_softening(user, u, pressure, rate, dt):
     """Return the factor by which released air reduces the pressure slopes of a chamber in a step [1].
 
@@ -438,13 +439,13 @@ def _predicted_softening(user, u, pressure, rate, dt):
     release, onset = user[u + _AIR], user[u + _ONSET]
     if pressure >= -onset or release == 0.0:
         return 1.0
-    if pressure_without_air(pressure, release, onset) + dt * rate > -onset:
+    if pressure_without_released_air(pressure, release, onset) + dt * rate > -onset:
         return 1.0
     return air_softening_factor(pressure, release, onset)
 
 
-@allocation_free
-def _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
+@compile_without_allocation
+def _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
     """Prepare the Sherman-Morrison solution of the stage equations that the supply couples.
 
     The stage equations are `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per
@@ -471,11 +472,11 @@ def _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, sc
         scratch[f + 2] /= divisor
 
 
-@inlined
-def _apply_coupling(count, rate, scratch):
+@compile_inlined
+def _apply_supply_coupling(count, rate, scratch):
     """Correct the stage rates of uncoupled chambers for the coupling through the supply, in place.
 
-    It applies the Sherman-Morrison factors of `_prepare_coupling` to `rate` (4 count,).
+    It applies the Sherman-Morrison factors of `_prepare_supply_coupling` to `rate` (4 count,).
     """
     pull = 0.0
     for a in range(0, 4 * count, 4):
@@ -489,7 +490,7 @@ def _apply_coupling(count, rate, scratch):
             rate[a + 3] -= scratch[f + 2] * pull
 
 
-@allocation_free
+@compile_without_allocation
 def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
     """Return the flows into both chambers and the force of one axis in a state, for logs and balances.
 
@@ -512,7 +513,7 @@ def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
         taken = pump_drive_volumes(user, u, x)[2]
         q_head, q_rod, _, _ = pump_flows(user, u + PUMP_OFFSET, act[0], act[2], act[3], taken)
         return q_head, q_rod, pump_drive_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
-    opening = axis_opening(user, u, act[0])
+    opening = axis_valve_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
     force = user[u + _AH] * act[2] - user[u + _AR] * act[3]
     if user[u + _BRISTLE_STIFFNESS] > 0.0:
@@ -529,7 +530,7 @@ _MAX_ITERATIONS = 60  # bisection alone converges to rounding errors in 60 steps
 _RELATIVE_TOLERANCE = 1.0e-13
 
 
-@allocation_free
+@compile_without_allocation
 def implicit_friction(user, u, velocity, other_force, inertia, dt):
     """Return the friction of an actuator at the end of an implicit step of a free body.
 
@@ -572,8 +573,8 @@ def implicit_friction(user, u, velocity, other_force, inertia, dt):
 _OFFSET = int(Slot.OFFSET)
 
 
-@allocation_free
-def drive_state(user, i, count, act, supply, time, x, v, command, gain):
+@compile_without_allocation
+def make_drive_state(user, i, count, act, supply, time, x, v, command, gain):
     """Collect the state of one drive, which is the input of the laws of terms.
 
     Args:
@@ -601,7 +602,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     return DriveState(time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force, 0.0, 0.0)
 
 
-@allocation_free
+@compile_without_allocation
 def add_command_terms(user, terms, drives, dt, time, scratch, out):
     """Add the terms that act on commands to the commands of the valves, evaluated at the middle of a step.
 
@@ -628,10 +629,10 @@ def add_command_terms(user, terms, drives, dt, time, scratch, out):
         for i in range(count):
             out[i] = command[i]
         return
-    compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+    compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
     supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
     middle = time + 0.5 * dt
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]
-        s = drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
+        s = make_drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
         out[i] = command[i] + sum_terms(terms, COMMAND, i, s, drives)

@@ -13,7 +13,7 @@ counterbalance valve can hold the oil of either side.
 
 import math
 
-from hydrotele.core.compiled import allocation_free, inlined
+from hydrotele.core.compiled import compile_inlined, compile_without_allocation
 from hydrotele.hydraulics.parameters import CURVE_KNOTS, CURVE_SIZE, Slot
 
 ATMOSPHERE = 101325.0  # Pa
@@ -21,7 +21,7 @@ _POLYTROPIC_EXPONENT = 1.4  # polytropic exponent of bubbles: adiabatic compress
 _MIN_ABSOLUTE_PRESSURE = 0.01  # Pa absolute, lower bound of a pressure
 
 
-@inlined
+@compile_inlined
 def valve_opening(spool, deadband):
     """Return the opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
 
@@ -45,7 +45,7 @@ def valve_opening(spool, deadband):
     return math.copysign(beyond / (1.0 - deadband), spool)
 
 
-@inlined
+@compile_inlined
 def orifice_flow(pressure_drop, flow_gain, smoothing):
     """Return the turbulent orifice flow, smooth at zero pressure drop, and its slope.
 
@@ -73,8 +73,8 @@ def orifice_flow(pressure_drop, flow_gain, smoothing):
     return scaled * pressure_drop, scaled * (1.0 - 0.5 * square * inverse)
 
 
-@inlined
-def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
+@compile_inlined
+def relief_and_makeup_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     """Return the flow into a chamber through its port relief valve and make-up valve, and its slope.
 
     `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`. The relief valve limits the pressure, and the
@@ -92,7 +92,7 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
 
     Source: nominal model, "Chambers".
 
-    >>> port_flow(33.0e6, 32.0e6, 1.0e-9, 0.3e6, 5.0e-9)
+    >>> relief_and_makeup_flow(33.0e6, 32.0e6, 1.0e-9, 0.3e6, 5.0e-9)
     (-0.001, -1e-09)
     """
     if pressure > port_relief:
@@ -102,8 +102,8 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
     return 0.0, 0.0
 
 
-@allocation_free
-def pressure_with_air(oil, release, onset=0.0):
+@compile_without_allocation
+def pressure_with_released_air(air_free_pressure, release, onset=0.0):
     """Return the pressure in a chamber whose oil releases dissolved air below atmosphere.
 
     Oil below atmospheric pressure releases air in proportion to the pressure deficit (Henry's law).
@@ -112,7 +112,7 @@ def pressure_with_air(oil, release, onset=0.0):
     `R = a beta`. It never reaches absolute zero.
 
     Args:
-        oil: P, pressure without released air, scalar [Pa] above atmosphere.
+        air_free_pressure: P, pressure without released air, scalar [Pa] above atmosphere.
         release: R = a beta, with the volume a of dissolved air at atmosphere per volume of oil and
             the bulk modulus beta, scalar [Pa]; 0 for oil without air.
         onset: pressure deficit at which the release starts, scalar [Pa]; 0 in a simulation, the
@@ -123,19 +123,19 @@ def pressure_with_air(oil, release, onset=0.0):
 
     Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" of the nominal model.
 
-    >>> round(pressure_with_air(-1.0e8, 1.35e8))
+    >>> round(pressure_with_released_air(-1.0e8, 1.35e8))
     -43106
-    >>> pressure_with_air(2.0e6, 1.35e8)
+    >>> pressure_with_released_air(2.0e6, 1.35e8)
     2000000.0
     """
-    lack = oil + onset
+    lack = air_free_pressure + onset
     if lack >= 0.0 or release == 0.0:
-        return oil
+        return air_free_pressure
     b = ATMOSPHERE + release - lack
     return 2.0 * lack * ATMOSPHERE / (b + math.sqrt(b * b + 4.0 * lack * ATMOSPHERE)) - onset
 
 
-@allocation_free
+@compile_without_allocation
 def air_compliance(pressure, fraction):
     """Return the compliance of air bubbles in the oil, per volume of oil [1/Pa].
 
@@ -160,21 +160,21 @@ def air_compliance(pressure, fraction):
     return fraction * (ATMOSPHERE / absolute) ** (1.0 / _POLYTROPIC_EXPONENT) / (_POLYTROPIC_EXPONENT * absolute)
 
 
-@allocation_free
-def pressure_without_air(pressure, release, onset=0.0):
-    """Return the pressure that oil would have without released air; inverts `pressure_with_air`.
+@compile_without_allocation
+def pressure_without_released_air(pressure, release, onset=0.0):
+    """Return the pressure that oil would have without released air; inverts `pressure_with_released_air`.
 
     Args:
         pressure: p, with released air, scalar [Pa] above atmosphere; limited to slightly above vacuum.
-        release: R of `pressure_with_air`: dissolved air fraction times bulk modulus, scalar [Pa].
+        release: R of `pressure_with_released_air`: dissolved air fraction times bulk modulus, scalar [Pa].
         onset: pressure deficit at which the release starts, scalar [Pa].
 
     Returns:
         P, pressure without released air, scalar [Pa] above atmosphere; equal to p if p >= -onset.
 
-    Source: inverse of `pressure_with_air`.
+    Source: inverse of `pressure_with_released_air`.
 
-    >>> round(pressure_without_air(pressure_with_air(-1.0e8, 1.35e8), 1.35e8))
+    >>> round(pressure_without_released_air(pressure_with_released_air(-1.0e8, 1.35e8), 1.35e8))
     -100000000
     """
     lack = pressure + onset
@@ -184,7 +184,7 @@ def pressure_without_air(pressure, release, onset=0.0):
     return lack * (1.0 + release / (lack + ATMOSPHERE)) - onset
 
 
-@inlined
+@compile_inlined
 def air_softening_factor(pressure, release, onset=0.0):
     """Return the factor by which air released below atmosphere softens the oil in a chamber.
 
@@ -192,13 +192,13 @@ def air_softening_factor(pressure, release, onset=0.0):
 
     Args:
         pressure: p, scalar [Pa] above atmosphere.
-        release: R of `pressure_with_air`: dissolved air fraction times bulk modulus, scalar [Pa].
+        release: R of `pressure_with_released_air`: dissolved air fraction times bulk modulus, scalar [Pa].
         onset: pressure deficit at which the release starts, scalar [Pa].
 
     Returns:
         dp/dP, scalar [1]; 1 if p >= -onset.
 
-    Source: derivative of `pressure_with_air`.
+    Source: derivative of `pressure_with_released_air`.
 
     >>> air_softening_factor(1.0e5, 1.35e8)
     1.0
@@ -211,7 +211,7 @@ def air_softening_factor(pressure, release, onset=0.0):
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 
-@allocation_free
+@compile_without_allocation
 def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
     """Return the relative opening of a counterbalance valve, and its slope.
 
@@ -244,8 +244,8 @@ def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
     return share, 1.0 / override
 
 
-@allocation_free
-def stop_force(position, velocity, low, high, stiffness, damping):
+@compile_without_allocation
+def end_stop_force(position, velocity, low, high, stiffness, damping):
     """Return the force of an end stop, a spring and a damper that only push, and its slopes.
 
     `F = max(0, k (x_low - x) - c v)` below the lower end, `-max(0, k (x - x_high) + c v)` above the
@@ -264,7 +264,7 @@ def stop_force(position, velocity, low, high, stiffness, damping):
 
     Source: Kelvin-Voigt contact without adhesion.
 
-    >>> stop_force(1.001, 0.0, 0.0, 1.0, 1.0e8, 1.0e5)[1:]
+    >>> end_stop_force(1.001, 0.0, 0.0, 1.0, 1.0e8, 1.0e5)[1:]
     (100000000.0, 100000.0)
     """
     if low <= position <= high:
@@ -276,7 +276,7 @@ def stop_force(position, velocity, low, high, stiffness, damping):
     return force, stiffness, damping
 
 
-@inlined
+@compile_inlined
 def friction_force(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -312,7 +312,7 @@ def friction_force(
     return dry + viscous * velocity * (1.0 + viscous_asymmetry * way)
 
 
-@allocation_free
+@compile_without_allocation
 def friction_slope(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
@@ -351,7 +351,7 @@ def friction_slope(
     return slope + viscous * (1.0 + asymmetry)
 
 
-@allocation_free
+@compile_without_allocation
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
     """Advance position and speed of a valve spool by one time step of its second-order dynamics.
 
@@ -405,8 +405,8 @@ _HEAD, _ROD = int(Slot.HOLDING_HEAD), int(Slot.HOLDING_ROD)
 _CURVES, _TANK_LEAK = int(Slot.CURVES), int(Slot.TANK_LEAKAGE)
 
 
-@inlined
-def axis_opening(user, u, spool):
+@compile_inlined
+def axis_valve_opening(user, u, spool):
     """Return the signed opening of an axis' valve at a spool position, from dead band and flow curve.
 
     `o = c(t)` with the travel beyond the dead band `t = (|s| - db) / (1 - db)`. The curve c is
@@ -437,7 +437,7 @@ def axis_opening(user, u, spool):
     return math.copysign(low + (high - low) * (travel - before) / (after - before), spool)
 
 
-@inlined
+@compile_inlined
 def inlet_gain(user, u, opening):
     """Return the flow gain of the metering edge that feeds a chamber.
 
@@ -455,7 +455,7 @@ def inlet_gain(user, u, opening):
     return user[u + _K] * edge * abs(opening)
 
 
-@inlined
+@compile_inlined
 def inlet_flow(drop, gain, smoothing, compensated):
     """Return the flow through an inlet edge, which can be pressure-compensated, and its slope.
 
@@ -479,7 +479,7 @@ def inlet_flow(drop, gain, smoothing, compensated):
     return orifice_flow(drop, gain, smoothing)
 
 
-@inlined
+@compile_inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
     """Return the flow out of a chamber through the valve's open edge to tank, and its slope.
 
@@ -493,7 +493,7 @@ def _outlet_flow(user, u, holding, gain, pressure, pilot):
     return _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot)
 
 
-@inlined
+@compile_inlined
 def _tank_leakage(user, u, holding, pressure, pilot):
     """Return the leakage out of a chamber through the spool's clearance to tank, and its slope.
 
@@ -504,7 +504,7 @@ def _tank_leakage(user, u, holding, pressure, pilot):
     return _counterbalanced_flow(user, u, holding, flow, leak, pressure, pilot)
 
 
-@inlined
+@compile_inlined
 def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
     """Reduce a flow to tank, and its slope, by the opening of the chamber's counterbalance valve.
 
@@ -518,7 +518,7 @@ def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
     return share * flow, share * slope + steep * flow
 
 
-@inlined
+@compile_inlined
 def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     """Return the valve flows into both chambers of an axis, and their slopes.
 
@@ -551,7 +551,7 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     return q_head - leak_head, q_rod - leak_rod, slope_head - steep_head, slope_rod - steep_rod
 
 
-@inlined
+@compile_inlined
 def _edge_flows(user, u, opening, p_supply, p_head, p_rod):
     """Return the valve flows into both chambers through the open edges of the spool, without leakage.
 

@@ -11,7 +11,7 @@ import numpy as np
 from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
 from hydrotele.machine.machine import Machine, Supply
-from hydrotele.terms.table import terms_table, terms_with_hysteresis
+from hydrotele.terms.table import encode_terms_table, terms_with_hysteresis
 
 CURVE_KNOTS = 8  # largest number of knots of a valve's flow curve in one direction
 
@@ -217,7 +217,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
         if axis.pump:
             _write_pump_drive(numbers, machine, name)
         elif axis.is_hydraulic and machine.supply:
-            _write_hydraulics(numbers, axis, machine.supply)
+            _write_valve_axis(numbers, axis, machine.supply)
         else:
             numbers[Slot.KIND] = ActuatorKind.FORCE
             numbers[Slot.OFFSET] = axis.force.offset if axis.force else 0.0
@@ -232,12 +232,12 @@ def machine_terms_table(machine: Machine) -> np.ndarray:
     """
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
-    areas = {name: machine.axes[name].hydraulic_drive.areas for name in machine.hydraulic_axes}
+    areas = {name: machine.axes[name].hydraulic_drive.effective_areas for name in machine.hydraulic_axes}
     at = first + own[0] if own else 0
-    return terms_table(machine.terms, actuator_order(machine), at, areas)
+    return encode_terms_table(machine.terms, actuator_order(machine), at, areas)
 
 
-def max_time_step(machine: Machine, name: str) -> float:
+def max_pump_drive_time_step(machine: Machine, name: str) -> float:
     """Return the longest time step that resolves the piston motion of an axis with its own pump.
 
     `k h^2 <= m + b h`: at most one radian of the piston's oscillation on its oil per step, or the
@@ -255,7 +255,7 @@ def max_time_step(machine: Machine, name: str) -> float:
     Source: stability limit of Verlet's method, h < 2 / omega, halved.
 
     >>> from hydrotele.machine.machine_file import load_machine
-    >>> max_time_step(load_machine("eha", "load_30_bar"), "piston")
+    >>> max_pump_drive_time_step(load_machine("eha", "load_30_bar"), "piston")
     0.002
     """
     numbers = actuator_parameters(machine)[name]
@@ -292,14 +292,14 @@ def _write_end_stop(numbers: np.ndarray, machine: Machine, name: str) -> None:
         numbers[Slot.STOP_STIFFNESS], numbers[Slot.STOP_DAMPING] = stop.stiffness, stop.damping
 
 
-def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
+def _write_valve_axis(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     """Write areas, volumes, valve and supply of an axis with a valve to its parameters (SLOT_COUNT,)."""
     valve = axis.valve
     assert valve is not None
     drive = axis.hydraulic_drive
     numbers[Slot.KIND] = ActuatorKind.CYLINDER if axis.cylinder else ActuatorKind.MOTOR
     numbers[Slot.STROKE] = axis.cylinder.stroke if axis.cylinder else 0.0
-    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = drive.areas
+    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = drive.effective_areas
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = drive.dead_volume
     numbers[Slot.LEAKAGE] = drive.leakage
     numbers[Slot.HOSE_COMPLIANCE] = drive.hose_compliance
@@ -325,7 +325,7 @@ def _write_pump_drive(numbers: np.ndarray, machine: Machine, name: str) -> None:
     assert cylinder and pump
     numbers[Slot.KIND] = ActuatorKind.PUMP_DRIVE
     numbers[Slot.STROKE] = cylinder.stroke
-    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = cylinder.areas
+    numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = cylinder.effective_areas
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = cylinder.dead_volume
     numbers[Slot.LEAKAGE] = cylinder.leakage
     numbers[Slot.ORIFICE_SMOOTHING] = Valve.model_fields["smoothing"].default
@@ -373,7 +373,7 @@ def _write_valve(numbers: np.ndarray, valve: Valve) -> None:
     numbers[Slot.METERING_PB], numbers[Slot.METERING_AT] = (
         valve.negative.inlet, valve.negative.outlet
     )  # fmt: skip
-    numbers[Slot.COMPENSATED_DROP] = valve.compensator_drop
+    numbers[Slot.COMPENSATED_DROP] = valve.compensator_pressure_drop
     numbers[Slot.TANK_LEAKAGE] = valve.tank_leakage
     numbers[Slot.ORIFICE_SMOOTHING] = valve.smoothing
     numbers[Slot.PORT_RELIEF] = valve.port_relief

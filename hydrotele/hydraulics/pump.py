@@ -15,7 +15,7 @@ are relative to the atmosphere.
 
 import math
 
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import PumpSlot
 
@@ -39,7 +39,7 @@ _VOID_PRESSURE = PumpSlot.LOAD_VOID_PRESSURE.value
 _LOAD_FRICTION, _LOAD_RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETURN.value
 
 
-@allocation_free
+@compile_without_allocation
 def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     """Return the pump speed after a step, signed by the side that the valve selects.
 
@@ -86,8 +86,8 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     return side * max((w + gain * torque) / (1.0 + gain * brake), STALLED_SPEED)
 
 
-@allocation_free
-def speed_after_switching(speed, end_speed):
+@compile_without_allocation
+def pump_speed_after_switching(speed, end_speed):
     """Return the pump speed at the start of a step, signed by the valve's side during the step.
 
     The valve switches at the start of the step while the pump keeps turning: only the sign changes.
@@ -102,7 +102,7 @@ def speed_after_switching(speed, end_speed):
 
     Source: ideal switching valve without spool dynamics.
 
-    >>> speed_after_switching(40.0, -39.0), speed_after_switching(40.0, 0.0)
+    >>> pump_speed_after_switching(40.0, -39.0), pump_speed_after_switching(40.0, 0.0)
     (-40.0, 0.0)
     """
     if end_speed == 0.0:
@@ -110,7 +110,7 @@ def speed_after_switching(speed, end_speed):
     return math.copysign(max(abs(speed), STALLED_SPEED), end_speed)
 
 
-@allocation_free
+@compile_without_allocation
 def accumulator_pressure(pressure, gas_volume, removed_volume):
     """Return the accumulator pressure after oil has left it, with isothermal gas.
 
@@ -132,7 +132,7 @@ def accumulator_pressure(pressure, gas_volume, removed_volume):
     return (pressure + ATMOSPHERE) * gas_volume / (gas_volume + removed_volume) - ATMOSPHERE
 
 
-@allocation_free
+@compile_without_allocation
 def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
     """Return the flows of pump and accumulator line into both chambers, and their slopes.
 
@@ -165,8 +165,8 @@ def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
     return pumped + line * (gas - p_head), -pumped, -leak - line, -leak
 
 
-@allocation_free
-def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
+@compile_without_allocation
+def chamber_compliance(volume, bulk_modulus, compliance, air, pressure):
     """Return the compliance (volume per pressure) of a chamber: oil, walls, and air by Boyle's law.
 
     `C = V / beta + C_w + V_air p_atm / (p + p_atm)^2`.
@@ -183,14 +183,14 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
 
     Source: Merritt 1967, sec. 1-4, with the air's stiffness at its pressure.
 
-    >>> round(1e12 * oil_compliance(1.0e-3, 1.0e9, 0.0, 1.0e-5, 101325.0), 2)
+    >>> round(1e12 * chamber_compliance(1.0e-3, 1.0e9, 0.0, 1.0e-5, 101325.0), 2)
     25.67
     """
     absolute = max(pressure + ATMOSPHERE, _MIN_AIR_PRESSURE)
     return volume / bulk_modulus + compliance + air * ATMOSPHERE / (absolute * absolute)
 
 
-@allocation_free
+@compile_without_allocation
 def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
     """Return the pressure rates of both chambers of a pump drive, and their slopes.
 
@@ -217,8 +217,8 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, 
     q_head, q_rod, slope_head, slope_rod = pump_flows(user, p, speed, p_head, p_rod, volumes[2])
     leak = leakage * (p_head - p_rod)
     beta = user[p + _BETA]
-    head = oil_compliance(volumes[0], beta, user[p + _SOFT_HEAD], user[p + _AIR_HEAD], p_head)
-    rod = oil_compliance(volumes[1], beta, user[p + _SOFT_ROD], user[p + _AIR_ROD], p_rod)
+    head = chamber_compliance(volumes[0], beta, user[p + _SOFT_HEAD], user[p + _AIR_HEAD], p_head)
+    rod = chamber_compliance(volumes[1], beta, user[p + _SOFT_ROD], user[p + _AIR_ROD], p_rod)
     return (
         (q_head - swept[0] - leak + added[0]) / head,
         (q_rod + swept[1] + leak + added[1]) / rod,
@@ -227,7 +227,7 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, 
     )
 
 
-@allocation_free
+@compile_without_allocation
 def load_pressure_step(user, p, pressure, velocity, dt):
     """Return the pressure in the load cylinder, which pushes against a pump drive, after a time step.
 
@@ -266,8 +266,8 @@ def load_pressure_step(user, p, pressure, velocity, dt):
     return min(risen, user[p + _LOAD_RELIEF] + user[p + _OVERRIDE] * area * max(0.0, velocity))
 
 
-@allocation_free
-def load_force(user, p, pressure):
+@compile_without_allocation
+def load_cylinder_force(user, p, pressure):
     """Return the force of the load cylinder against extension of a pump drive, without friction [N].
 
     `p` is the index of the pump parameters in `user`, and `pressure` that in the load cylinder [Pa].
@@ -277,7 +277,7 @@ def load_force(user, p, pressure):
     return user[p + _AREA] * pressure
 
 
-@allocation_free
+@compile_without_allocation
 def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """Return the friction of a pump drive's piston at the end of a step, including sticking.
 
@@ -303,7 +303,7 @@ def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """
     ratio = velocity / seal[2]
     seals = seal[0] + seal[1] * math.exp(-ratio * ratio)
-    load = user[p + _LOAD_FRICTION] * load_force(user, p, load_pressure)
+    load = user[p + _LOAD_FRICTION] * load_cylinder_force(user, p, load_pressure)
     forward = seals * (1.0 + seal[4]) + load
     backward = seals * (1.0 - seal[4]) + load + user[p + _LOAD_RETURN]
     if dt == 0.0:

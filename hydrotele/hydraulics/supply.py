@@ -1,13 +1,13 @@
 """Shared hydraulic supply: pressure from the flows of the valves, and pump with a time constant.
 
 Flat arrays have the layout described in `circuit`; `ports` has four values per axis, see
-`compute_ports`.
+`compute_inlet_conditions`.
 """
 
 import math
 
-from hydrotele.core.compiled import allocation_free, inlined
-from hydrotele.hydraulics.laws import axis_opening, inlet_flow, inlet_gain
+from hydrotele.core.compiled import compile_inlined, compile_without_allocation
+from hydrotele.hydraulics.laws import axis_valve_opening, inlet_flow, inlet_gain
 from hydrotele.hydraulics.parameters import SLOT_COUNT, ActuatorKind, Slot
 
 _MAX_NEWTON_STEPS = 60
@@ -24,8 +24,8 @@ _ADDED, _OVERRIDE = int(Slot.ADDED_DELIVERY), int(Slot.RELIEF_OVERRIDE)
 _KIND, _PUMPED = int(Slot.KIND), float(ActuatorKind.PUMP_DRIVE)
 
 
-@allocation_free
-def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, override=0.0):
+@compile_without_allocation
+def solve_supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, override=0.0):
     """Solve for the supply pressure at which the pump flow equals the flows of valves and relief.
 
     Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` with the smoothed root g over the valves
@@ -51,7 +51,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
 
     >>> import numpy as np
     >>> one_valve = np.array([2.0e-6, 5.0e6, 0.0, 0.0])
-    >>> round(supply_pressure(one_valve, 1, 5.0e4, 28.0e6, 5.0e-3) / 1e6, 3)
+    >>> round(solve_supply_pressure(one_valve, 1, 5.0e4, 28.0e6, 5.0e-3) / 1e6, 3)
     11.25
     """
     top = relief + override * pump_flow
@@ -94,8 +94,8 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
     return p
 
 
-@inlined
-def compute_ports(user, act, spool, ports, first, count, ahead, rate):
+@compile_inlined
+def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate):
     """Compute, for the supply pressure, valve opening, inlet gain and fed chamber pressure of every axis.
 
     Args:
@@ -120,7 +120,7 @@ def compute_ports(user, act, spool, ports, first, count, ahead, rate):
         if user[u + _KIND] == _PUMPED:  # does not use the shared supply
             ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
             continue
-        opening = axis_opening(user, u, spool[4 * i])
+        opening = axis_valve_opening(user, u, spool[4 * i])
         ports[4 * i] = inlet_gain(user, u, opening)
         ports[4 * i + 2], ports[4 * i + 3] = user[u + _DROP], opening
         side = 2 if opening > 0.0 else 3
@@ -129,7 +129,7 @@ def compute_ports(user, act, spool, ports, first, count, ahead, rate):
             ports[4 * i + 1] += ahead * rate[4 * i + side]
 
 
-@allocation_free
+@compile_without_allocation
 def delivered_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump delivers, including terms.
 
@@ -152,7 +152,7 @@ def delivered_flow_fraction(user, first, act):
     return add_flow_fractions(pump_flow_fraction(user, first, act), added)
 
 
-@allocation_free
+@compile_without_allocation
 def pump_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump itself delivers, without terms.
 
@@ -174,7 +174,7 @@ def pump_flow_fraction(user, first, act):
     return min(1.0, max(_MIN_FLOW_FRACTION, act[int(user[s + _DELIVERY])]))
 
 
-@allocation_free
+@compile_without_allocation
 def add_flow_fractions(fraction, added):
     """Add the contribution of terms to a pump's flow fraction, with a positive lower bound.
 
@@ -190,8 +190,8 @@ def add_flow_fractions(fraction, added):
     return max(_MIN_FLOW_FRACTION, fraction + added)
 
 
-@allocation_free
-def pump_response(user, first, demanded, fraction, dt):
+@compile_without_allocation
+def advance_pump_flow_fraction(user, first, demanded, fraction, dt):
     """Return the flow fraction of a pump with first-order lag after a time, by the exact exponential.
 
     Args:
@@ -210,7 +210,7 @@ def pump_response(user, first, demanded, fraction, dt):
     return demanded + (fraction - demanded) * math.exp(-dt / lag) if lag > 0.0 else 1.0
 
 
-@allocation_free
+@compile_without_allocation
 def demanded_flow_fraction(user, first, count, ports):
     """Return the fraction of the maximum pump flow that the valves demand.
 
@@ -225,7 +225,7 @@ def demanded_flow_fraction(user, first, count, ports):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_ports` writes them.
+            opening [1] of every axis, as `compute_inlet_conditions` writes them.
 
     Returns:
         q, scalar [1], 0 .. 1.
@@ -236,7 +236,7 @@ def demanded_flow_fraction(user, first, count, ports):
     return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOT_COUNT + _PUMP])
 
 
-@allocation_free
+@compile_without_allocation
 def drawn_flow(user, first, count, ports, supply):
     """Return the flow that all valves and the pump's internal leakage draw at a supply pressure.
 
@@ -245,7 +245,7 @@ def drawn_flow(user, first, count, ports, supply):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_ports` writes them.
+            opening [1] of every axis, as `compute_inlet_conditions` writes them.
         supply: p_s, scalar [Pa].
 
     Returns:
@@ -262,7 +262,7 @@ def drawn_flow(user, first, count, ports, supply):
     return drawn
 
 
-@inlined
+@compile_inlined
 def max_supply_pressure(user, first, count, ports):
     """Return the upper limit of the supply pressure: relief setting or load-sensing pressure.
 
@@ -271,7 +271,7 @@ def max_supply_pressure(user, first, count, ports):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_ports` writes them.
+            opening [1] of every axis, as `compute_inlet_conditions` writes them.
 
     Returns:
         p_s, scalar [Pa].
@@ -289,7 +289,7 @@ def max_supply_pressure(user, first, count, ports):
     return most
 
 
-@inlined
+@compile_inlined
 def circuit_supply_pressure(user, first, count, ports, fraction):
     """Compute the supply pressure of a circuit from pump, relief valve and load sensing.
 
@@ -301,7 +301,7 @@ def circuit_supply_pressure(user, first, count, ports, fraction):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_ports` writes them.
+            opening [1] of every axis, as `compute_inlet_conditions` writes them.
         fraction: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
@@ -312,11 +312,11 @@ def circuit_supply_pressure(user, first, count, ports, fraction):
     s, most = first * SLOT_COUNT, max_supply_pressure(user, first, count, ports)
     flow = user[s + _PUMP] * fraction
     droop, override = user[s + _DROOP], user[s + _OVERRIDE]
-    return supply_pressure(ports, count, user[s + _D], most, flow, droop, override)
+    return solve_supply_pressure(ports, count, user[s + _D], most, flow, droop, override)
 
 
-@allocation_free
-def supply_coupling(user, first, count, ports, supply, out):
+@compile_without_allocation
+def compute_supply_pressure_derivatives(user, first, count, ports, supply, out):
     """Compute the derivatives of the supply pressure with respect to the fed chamber pressures.
 
     `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` if the pump flow limits the pressure. It is 1 for the
@@ -329,7 +329,7 @@ def supply_coupling(user, first, count, ports, supply, out):
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_ports` writes them.
+            opening [1] of every axis, as `compute_inlet_conditions` writes them.
         supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].

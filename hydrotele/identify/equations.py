@@ -22,8 +22,8 @@ from hydrotele.identify.motion import (
 )
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import SmoothedSignal, sample_errors, smooth
-from hydrotele.multibody.inverse_dynamics import Regressor, sign_uncertainty
+from hydrotele.identify.smoothing import SmoothedSignal, sample_smoothing_errors, smooth_and_differentiate
+from hydrotele.multibody.inverse_dynamics import Regressor, friction_sign_std
 
 _HALF_LENGTH_PERIODS = 1.5  # half length of the low-pass filter, in periods of its cutoff
 _KAISER_BETA = 5.0  # window parameter: ripple of -50 dB
@@ -134,7 +134,7 @@ def build_equations(
     for first in range(0, count, per_chunk := max(1, _ROWS_PER_CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
-        last, doubt, damping, pose = _evaluate_rows(setup, motions[:, rows], errors.select_rows(rows), start)
+        last, doubt, damping, pose = _evaluate_regressor_rows(setup, motions[:, rows], errors.select_rows(rows), start)
         damped.append(apply_low_pass(damping, low, thin))
         parts.append(apply_low_pass(last.matrix, low, thin))
         doubts.append(apply_low_pass(doubt, weights, thin))
@@ -143,7 +143,7 @@ def build_equations(
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
     spread = np.zeros(0)
     if with_noise:
-        spread = _compute_motion_noise(record, setup, position_resolution, motions, errors, low, thin)
+        spread = _compute_regressor_error_moments(record, setup, position_resolution, motions, errors, low, thin)
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
         record.name, band, np.concatenate(parts), 
@@ -178,7 +178,7 @@ def _compute_motion(
     return compute_joint_motion(record.position, record.period, position_resolution, processing)
 
 
-def _compute_motion_noise(
+def _compute_regressor_error_moments(
     record: IdentificationRecord, setup: RegressorSetup, position_resolution: Resolution, motions: np.ndarray,
     errors: RateErrors, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
@@ -188,12 +188,12 @@ def _compute_motion_noise(
     sampled about that of the optimal smoother.
     """
     rows = slice(0, max(_MAX_NOISE_ROWS, 4 * len(low)))
-    smoothed = smooth(record.position[rows], record.period, position_resolution.noise)
+    smoothed = smooth_and_differentiate(record.position[rows], record.period, position_resolution.noise)
     likely = np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
-    taken = _evaluate_rows(setup, motions[:, rows], errors.select_rows(rows), None)[0].matrix
+    taken = _evaluate_regressor_rows(setup, motions[:, rows], errors.select_rows(rows), None)[0].matrix
     total = np.zeros((taken.shape[1], taken.shape[2], taken.shape[2]))
-    for draw in sample_errors(smoothed, _MOTION_ERROR_SAMPLES):
-        error = apply_low_pass(taken - _evaluate_rows(setup, likely - draw, None, None)[0].matrix, low, thin)
+    for draw in sample_smoothing_errors(smoothed, _MOTION_ERROR_SAMPLES):
+        error = apply_low_pass(taken - _evaluate_regressor_rows(setup, likely - draw, None, None)[0].matrix, low, thin)
         total += np.einsum("nkm,nkl->kml", error, error)
     return total / (len(error) * _MOTION_ERROR_SAMPLES)
 
@@ -219,12 +219,12 @@ def predict_forces(
     for first in range(0, motions.shape[1], _ROWS_PER_CHUNK):
         rows = slice(first, first + _ROWS_PER_CHUNK)
         errors = None if rate_std is None else RateErrors(setup.given_joints, rate_std[rows])
-        table, _, damping, start = _evaluate_rows(setup, motions[:, rows], errors, start)
+        table, _, damping, start = _evaluate_regressor_rows(setup, motions[:, rows], errors, start)
         out.append(table.matrix @ value + damping)
     return np.concatenate(out)
 
 
-def _evaluate_rows(
+def _evaluate_regressor_rows(
     setup: RegressorSetup,
     motions: np.ndarray,
     errors: RateErrors | None,
@@ -243,7 +243,7 @@ def _evaluate_rows(
         drives) of stated damping and springs, and the joint positions (v,) of the last row.
     """
     chain = setup.chain
-    found = setup.project(*motions, start=start)
+    found = setup.project_motion_on_drives(*motions, start=start)
     spread = None
     if errors is not None and np.isfinite(errors.std).all():
         measured = [chain.index(name) for name in errors.axes]
@@ -251,7 +251,7 @@ def _evaluate_rows(
     table = setup.compute_regressor(found, spread)
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
-        doubt = sign_uncertainty(chain, found, table.drives, setup.friction_terms, spread)
+        doubt = friction_sign_std(chain, found, table.drives, setup.friction_terms, spread)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
     return (
         table,
@@ -336,9 +336,9 @@ def low_pass_forces(force: np.ndarray, period: float, filter_weights: np.ndarray
     return out
 
 
-def concatenate_field(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
-    """Concatenate an array of the equations of several runs; `of` returns the array of one run."""
-    return np.concatenate([of(part) for part in parts])
+def concatenate_over_runs(parts: Sequence[Equations], get_array: Callable[[Equations], np.ndarray]) -> np.ndarray:
+    """Concatenate an array of the equations of several runs; `get_array` returns the array of one run."""
+    return np.concatenate([get_array(part) for part in parts])
 
 
 _MIN_BAND_PERIODS = 4.0  # periods of the band, shortest run: the low-pass filter spans three
@@ -468,7 +468,7 @@ def stack_equations(
     if not made:
         raise InputError(_ERROR_CONTEXT, f"all runs are too short for a band of {band:.3g} Hz: log longer runs")
     table, equations = made[0][1], [e for e, _ in made]
-    force = concatenate_field(equations, lambda e: e.force)
+    force = concatenate_over_runs(equations, lambda e: e.force)
     columns = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
     if not columns:
         raise InputError(_ERROR_CONTEXT, "no drive has a known force in any run: log both pressures")
@@ -484,6 +484,6 @@ def stack_equations(
     starts = np.cumsum([0, *(len(e.time) for e in equations)])
     return StackedEquations(
         tuple(kept), table, columns, rows, starts, spacing,
-        concatenate_field(equations, lambda e: e.matrix)[rows][:, columns], force[rows][:, columns],
-        concatenate_field(equations, lambda e: e.friction_sign_uncertainty)[rows][:, columns], tuple(notes),
+        concatenate_over_runs(equations, lambda e: e.matrix)[rows][:, columns], force[rows][:, columns],
+        concatenate_over_runs(equations, lambda e: e.friction_sign_uncertainty)[rows][:, columns], tuple(notes),
     )  # fmt: skip

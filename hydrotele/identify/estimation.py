@@ -1,6 +1,6 @@
 """Estimators of parameters that are linear in the drive forces, with their uncertainty.
 
-`estimate` solves (n, k, m) regressors and (n, k) forces of k drives over n rows by least squares.
+`estimate_linear_parameters` solves (n, k, m) regressors and (n, k) forces of k drives over n rows by least squares.
 `weight_equations` and `find_identifiable_parameters` weight the equations and select the base parameters that noisy
 data determine; all other combinations keep their nominal values. `reduce_parameters` drops and
 merges friction parameters, because poorly determined passive-joint friction degrades all estimates.
@@ -24,7 +24,7 @@ from hydrotele.identify.identifiability import (
     reference_sizes,
 )
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor, is_deviation
+from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor, is_friction_deviation
 
 _ESTIMATE_CONTEXT = "estimate"
 _MAX_AUTOREGRESSION_ORDER = 30  # rows, highest order of the autoregression of the errors
@@ -87,7 +87,7 @@ class Estimate:
         return float(np.sum((away @ ways[:, kept]) ** 2 / values[kept]))
 
 
-def estimate(
+def estimate_linear_parameters(
     matrix: np.ndarray, forces: np.ndarray, covariance: np.ndarray | None = None, *,
     instruments: np.ndarray | None = None, ridge: float = 0.0, truncation: float = 0.0,
     prior: np.ndarray | None = None, order: int | None = None,
@@ -135,9 +135,9 @@ def estimate(
         raise InputError(_ESTIMATE_CONTEXT, f"column {int(np.argmin(size))} has no effect: remove it")
     start = np.zeros(x.shape[2]) if prior is None else np.asarray(prior, float)
     shape = _SolverOptions(start, ridge, truncation, covariance is None)
-    value, inverse, solved, scale = _solve(x, y, z, shape)
+    value, inverse, solved, scale = _solve_with_drive_weights(x, y, z, shape)
     error = y - x @ value
-    follow = autoregression(error, order)
+    follow = fit_autoregression(error, order)
     spread = _propagate_covariance(inverse, error, follow) * y.size / (y.size - x.shape[2])
     gain = np.zeros((len(value), *forces.shape))
     gain[:, there] = inverse @ white
@@ -171,7 +171,9 @@ class _SolutionProperties(NamedTuple):
     rank: int
 
 
-def _solve(x, y, z, shape: _SolverOptions) -> tuple[np.ndarray, np.ndarray, _SolutionProperties, np.ndarray]:
+def _solve_with_drive_weights(
+    x, y, z, shape: _SolverOptions
+) -> tuple[np.ndarray, np.ndarray, _SolutionProperties, np.ndarray]:
     """Solve y = x @ parameters by least squares, or with instruments z if given.
 
     If requested, the drives are weighted by their residuals and the equations solved again.
@@ -223,7 +225,7 @@ def _propagate_covariance(inverse: np.ndarray, error: np.ndarray, coefficients: 
     return np.einsum("pnc,cd,qnd->pq", late, between, late, optimize=True).reshape(p, p)
 
 
-def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
+def fit_autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
     """Fit an autoregressive model, which predicts each error from previous ones, to time series of errors.
 
     Args:
@@ -358,7 +360,7 @@ class WeightedEquations:
     covariance: np.ndarray | None = None
     instruments: np.ndarray | None = None
 
-    def estimate_base(
+    def estimate_base_parameters(
         self, identifiability: Identifiability, ridge: float = 0.0, truncation: float = 0.0,
         order: int | None = None,
     ) -> Estimate:  # fmt: skip
@@ -377,7 +379,7 @@ class WeightedEquations:
         given = identifiability.combination @ self.table.nominal
         rest = self.force - self.matrix @ self.table.nominal + base @ given
         aside = None if self.instruments is None else self.instruments[:, :, identifiability.base]
-        return estimate(
+        return estimate_linear_parameters(
             base, rest, self.covariance, instruments=aside, ridge=ridge, truncation=truncation, prior=given,
             order=order,
         )  # fmt: skip
@@ -408,13 +410,13 @@ def weight_equations(
         return WeightedEquations(data.table, ones, alike, data.matrix, data.force, np.eye(drives))
     plain = WeightedEquations(data.table, ones, alike, data.matrix, data.force)
     doubtful = estimate_error_variances(
-        plain.estimate_base(structure, order=0).residual, data.friction_sign_uncertainty
+        plain.estimate_base_parameters(structure, order=0).residual, data.friction_sign_uncertainty
     )
     weight = compute_weights(doubtful, data.friction_sign_uncertainty)
     matrix, force = weight[:, :, None] * data.matrix, weight * data.force
     found = WeightedEquations(data.table, weight, doubtful, matrix, force)
     if method == "gauss_markov":
-        error = found.estimate_base(structure, order=0).residual
+        error = found.estimate_base_parameters(structure, order=0).residual
         if period:  # a difference of periods has no repeated model error and twice the variance
             error = (error - data.shift_by_period(error, period)) / np.sqrt(2.0)
             error = error[np.isfinite(error).all(axis=1)]
@@ -450,12 +452,12 @@ def find_identifiable_parameters(
     if not len(structure.base):
         raise InputError(_ERROR_CONTEXT, "no parameter has an effect on the forces of this motion")
     plain = replace(data, instruments=None)  # inaccurate for poorly determined parameters
-    noise = _long_run_std(plain.estimate_base(structure, order=0).residual)
+    noise = _long_run_std(plain.estimate_base_parameters(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
     asked = np.array([
         name.partition(".")[2] not in resting
-        or not (name.partition(".")[0] in FRICTION_TERMS or is_deviation(name)) for name in table.names
+        or not (name.partition(".")[0] in FRICTION_TERMS or is_friction_deviation(name)) for name in table.names
     ])  # fmt: skip
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
     told = classify_noisy_parameters(rows, table.names, sizes, asked)
@@ -506,7 +508,7 @@ def _long_run_std(residual: np.ndarray) -> np.ndarray:
 
     They are at least those of the residuals.
     """
-    follow = autoregression(residual)
+    follow = fit_autoregression(residual)
     fresh = residual.copy()
     for q, kept in enumerate(follow, start=1):
         fresh[q:] -= kept * residual[:-q]
@@ -596,23 +598,23 @@ def reduce_parameters(
     first: dict[tuple[str, ...], float] = {}
     separate: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
 
-    def fit():
+    def fit_remaining_parameters():
         stacked = np.stack([sum(columns[n] for n in group) for group in groups], axis=2)
         # the covariance is known, so residuals do not scale it
-        found = estimate(stacked, forces, covariance, order=0)
+        found = estimate_linear_parameters(stacked, forces, covariance, order=0)
         normal = np.einsum("nkp,kl,nlq->pq", stacked, whitened.T @ whitened, stacked, optimize=True)
         spread = np.linalg.inv(normal)
         error = found.residual @ whitened.T
         return found.value, spread, float(np.sum(error**2)), error.size - len(groups)
 
-    def note(action, which, figure, spread, misfit, free):
+    def record_step(action, which, figure, spread, misfit, free):
         std = dict(zip(groups, np.sqrt(np.diag(spread)), strict=True))
         if not first:
             first.update(std)
         wide = max((s / first[g] for g, s in std.items() if g[0] not in kind), default=1.0)
         steps.append(ReductionStep(action, which, figure, len(groups), float(wide), misfit / free))
 
-    def drop(now):
+    def drop_insignificant(now):
         while True:
             ratio = np.abs(now[0]) / np.sqrt(np.diag(now[1]))
             open_ = [k for k, g in enumerate(groups) if g[0] in kind]
@@ -620,10 +622,10 @@ def reduce_parameters(
             if weakest is None or ratio[weakest] >= significant:
                 return now
             gone, figure = groups.pop(weakest), float(ratio[weakest])
-            now = fit()
-            note("drop", gone, figure, *now[1:])
+            now = fit_remaining_parameters()
+            record_step("drop", gone, figure, *now[1:])
 
-    def merge(now):
+    def merge_correlated(now):
         while True:
             std = np.sqrt(np.diag(now[1]))
             pairs = [
@@ -640,14 +642,14 @@ def reduce_parameters(
             groups[b] = groups[b] + groups[a]
             merged = groups[b]
             groups.pop(a)
-            now = fit()
+            now = fit_remaining_parameters()
             if now[2] - old[2] > significant**2:  # the two parameters differ significantly
                 separate.add((before[a], before[b]))
                 groups[:], now = before, old
                 continue
-            note("merge", merged, float(figure), *now[1:])
+            record_step("merge", merged, float(figure), *now[1:])
 
-    now = fit()
-    note("start", tuple(names), 0.0, *now[1:])
-    now = drop(merge(drop(now)))
+    now = fit_remaining_parameters()
+    record_step("start", tuple(names), 0.0, *now[1:])
+    now = drop_insignificant(merge_correlated(drop_insignificant(now)))
     return Reduction(tuple(steps), tuple(groups), now[0], np.sqrt(np.diag(now[1])))

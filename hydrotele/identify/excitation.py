@@ -119,7 +119,7 @@ def compute_information(
         base: indices of the p base parameters.
         sizes: (p,) units in which the parameters are expressed; 1 by default.
     """
-    found = setup.project(*motions)
+    found = setup.project_motion_on_drives(*motions)
     table = setup.compute_regressor(found)
     noise = np.asarray(noise, float)
     if noise.ndim == 1:
@@ -132,7 +132,7 @@ def compute_information(
     return flat.T @ flat / len(found.rate)
 
 
-def select_informative_base(
+def select_determinable_parameters(
     machine: Machine, setup: RegressorSetup, noise: np.ndarray, period: float = 20.0, seed: int = 0
 ) -> np.ndarray:
     """Select the base parameters that a random motion of the machine determines despite force noise.
@@ -155,7 +155,7 @@ def select_informative_base(
         limits.axes, period, limits.centre, wide * np.cos(phase), wide * np.sin(phase), 0, 0, 0
     ).evaluate(time)
     motion[0] = np.clip(motion[0], limits.lower, limits.upper)
-    found = setup.project(*motion)
+    found = setup.project_motion_on_drives(*motion)
     table = setup.compute_regressor(found)
     forces = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
     flat = (table.matrix / noise[:, None]).reshape(-1, len(table.names))
@@ -228,15 +228,15 @@ def design_motion(
     k, rng, best = len(setup.given_joints), np.random.default_rng(seed), None
     sizes = _parameter_scales(setup, base, limits.centre)
 
-    def excitation(x: np.ndarray) -> Excitation:
+    def build_excitation(x: np.ndarray) -> Excitation:
         parts = x.reshape(k, 1 + 2 * harmonics)
         turn = np.arange(1, harmonics + 1)
         mean = limits.centre + limits.half_range * np.tanh(parts[:, 0])
         wide = limits.half_range[:, None] * parts[:, 1:] / np.tile(turn, 2)
         return Excitation(limits.axes, period, mean, wide[:, :harmonics], wide[:, harmonics:], 0.0, 0.0, len(base))
 
-    def measure(x: np.ndarray, time: np.ndarray = time) -> tuple[float, np.ndarray]:
-        motions = excitation(x).evaluate(time)
+    def evaluate_criterion_and_limits(x: np.ndarray, time: np.ndarray = time) -> tuple[float, np.ndarray]:
+        motions = build_excitation(x).evaluate(time)
         inside = np.clip(motions[0], limits.lower, limits.upper)
         held = np.stack([inside, motions[1], motions[2]])
         info = compute_information(setup, held, noise, base, sizes)
@@ -245,31 +245,31 @@ def design_motion(
 
     def cost(x: np.ndarray, press: float) -> float:
         try:
-            value, use = measure(x)
+            value, use = evaluate_criterion_and_limits(x)
         except InputError:
             return 1e6
         return -value + press * float(np.mean(np.maximum(use - 1.0, 0.0) ** 2))
 
     for start in range(starts):
         drawn = [
-            _scale_into_limits(rng.normal(0.0, 0.3, (k, 1 + 2 * harmonics)).ravel(), measure)
+            _scale_into_limits(rng.normal(0.0, 0.3, (k, 1 + 2 * harmonics)).ravel(), evaluate_criterion_and_limits)
             for _ in range(_START_CANDIDATES)
         ]
-        x = max(drawn, key=lambda one: measure(one)[0])
+        x = max(drawn, key=lambda one: evaluate_criterion_and_limits(one)[0])
         for step, press in enumerate(_PENALTY_WEIGHTS):
             if progress:
                 progress(f"start {start + 1}", (start + step / len(_PENALTY_WEIGHTS)) / starts)
             x = minimize(cost, x, (press,), method="L-BFGS-B", options={"maxiter": iterations}).x
-        x = _scale_into_limits(x, measure)
-        value, use = measure(x)
+        x = _scale_into_limits(x, evaluate_criterion_and_limits)
+        value, use = evaluate_criterion_and_limits(x)
         if use.max() <= 1.0 and (best is None or value > best[0]):
             best = (value, x, float(use.max()))
     if best is None:
         raise InputError(_ERROR_CONTEXT, "no motion within the limits was found: increase starts")
     between = np.arange(_CHECK_RATE_FACTOR * rows) * period / (_CHECK_RATE_FACTOR * rows)
-    x = _scale_into_limits(best[1], lambda x: measure(x, between), 0.998)
-    value, use = measure(x, between)
-    made, worst = excitation(x), float(use.max())
+    x = _scale_into_limits(best[1], lambda x: evaluate_criterion_and_limits(x, between), 0.998)
+    value, use = evaluate_criterion_and_limits(x, between)
+    made, worst = build_excitation(x), float(use.max())
     return Excitation(made.axes, period, made.mean, made.sin, made.cos, value, worst, len(base))
 
 
@@ -291,7 +291,7 @@ def _parameter_scales(setup: RegressorSetup, base: Sequence[int] | np.ndarray, m
     They are the magnitudes of the given values, at least 1.
     """
     still = np.zeros((1, len(middle)))
-    found = setup.project(middle[None], still, still)
+    found = setup.project_motion_on_drives(middle[None], still, still)
     table = setup.compute_regressor(found)
     return np.maximum(np.abs(table.nominal[np.asarray(base)]), 1.0)
 
@@ -328,7 +328,7 @@ class DriveLimits:
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
         """Return the utilisation (n, l) of joint ranges, strokes, speeds and accelerations, 1 at the limit."""
-        found = self.setup.project(*clipped)
+        found = self.setup.project_motion_on_drives(*clipped)
         return np.concatenate(
             [
                 1.0 + (motions[0] - self.upper) / self.half_range,
@@ -383,7 +383,7 @@ class MachineLimits:
             1.0 + (motions[0] - self.upper) / self.half_range,
             1.0 + (self.lower - motions[0]) / self.half_range,
         ]
-        found = self.setup.project(*clipped)
+        found = self.setup.project_motion_on_drives(*clipped)
         table = replace(self.setup, offsets=None).compute_regressor(found)
         forces = table.matrix @ table.nominal
         flow = np.zeros(len(forces))
@@ -407,7 +407,7 @@ class MachineLimits:
             limit = abs(facts.force.gain) * facts.force.command_limit
             return np.abs(force) / (_MAX_FORCE_FRACTION * limit)
         assert supply is not None and facts.valve is not None
-        head, rod = facts.hydraulic_drive.areas
+        head, rod = facts.hydraulic_drive.effective_areas
         speed = projection.rate[:, j]
         taken = np.where(speed > 0.0, head * speed, -rod * speed)
         flow += taken

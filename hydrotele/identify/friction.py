@@ -1,8 +1,8 @@
 """Friction near zero speed: deviations from the friction law, drives at rest, and the friction force by speed.
 
-`add_deviations` adds parameters for the error of a friction law near zero speed. Without them an error of the
-law there, such as that of a smooth or elastic contact, biases the friction at all speeds. `compute_friction_forces`
-evaluates the identified friction at round speeds, with its standard deviation.
+`add_low_speed_friction_deviations` adds parameters for the error of a friction law near zero speed. Without
+them an error of the law there, such as that of a smooth or elastic contact, biases the friction at all speeds.
+`compute_friction_forces` evaluates the identified friction at round speeds, with its standard deviation.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ class FrictionForce(NamedTuple):
     unit: str
 
 
-def compute_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -> dict[str, tuple[float, float]]:
+def compute_drive_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -> dict[str, tuple[float, float]]:
     """Compute the RMS and the maximum speed of each moving drive over all runs [rad/s] or [m/s].
 
     Args:
@@ -59,7 +59,9 @@ def compute_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -
         resolved = estimate_resolution(record.position, record.period, record.position_noise)
         motion = compute_joint_motion(record.position, record.period, resolved, Processing("optimal"))
         thin = max(1, len(record.force) // _MAX_ROWS)
-        rate = setup.project(motion.value[::thin], motion.rate[::thin], motion.acceleration[::thin]).rate
+        rate = setup.project_motion_on_drives(
+            motion.value[::thin], motion.rate[::thin], motion.acceleration[::thin]
+        ).rate
         square, count = square + np.sum(rate**2, axis=0), count + len(rate)
         highest = np.maximum(highest, np.abs(rate).max(axis=0))
         is_moving |= resolved.is_moving
@@ -92,7 +94,7 @@ def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]
     return replace(setup, friction_terms=terms)
 
 
-def add_deviations(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
+def add_low_speed_friction_deviations(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
     """Add parameters for deviations of the drives' friction from its law near zero speed.
 
     Args:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, is_deviation
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, is_friction_deviation
 
 STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL = "unidentifiable", "combination", "full"
 STATUS_WEAK = "weak"  # influence below the noise
@@ -234,17 +234,17 @@ def reference_sizes(
     for name, given in zip(table.names, table.nominal, strict=True):
         kind, _, place = name.partition(".")
         if kind in BODY_PARAMETERS:
-            sizes.append(_body_size(chain.inertia, chain.bodies.index(place), kind))
+            sizes.append(_body_parameter_size(chain.inertia, chain.bodies.index(place), kind))
         elif kind == "drive_inertia":
             sizes.append(max(float(chain.armature[chain.index(place)]), usual))
         else:
-            part = 1.0 if is_deviation(name) else _DEFAULT_FORCE_FRACTION
+            part = 1.0 if is_friction_deviation(name) else _DEFAULT_FORCE_FRACTION
             size = part * known.get(place, _PIN_LEVER_ARM_M * usual)
             sizes.append(max(abs(given), size / _REFERENCE_SPEED if kind.startswith("viscous") else size))
     return np.maximum(sizes, 1e-12)
 
 
-def _body_size(inertia: np.ndarray, body: int, kind: str) -> float:
+def _body_parameter_size(inertia: np.ndarray, body: int, kind: str) -> float:
     mass = inertia[body, 0] or inertia[:, 0].max()
     own = inertia[body] if inertia[body, 0] else inertia[int(np.argmax(inertia[:, 0]))]
     radius = np.sqrt((own[4] + own[7] + own[9]) / 2.0 / mass)

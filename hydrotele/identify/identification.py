@@ -36,35 +36,35 @@ from hydrotele.identify.estimation import (
     weight_equations,
 )
 from hydrotele.identify.friction import (
-    add_deviations,
+    add_low_speed_friction_deviations,
+    compute_drive_speeds,
     compute_friction_forces,
-    compute_speeds,
     set_rest_speeds,
 )
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.identify.motion import (
     Processing,
     Resolution,
-    apply_adjoint,
+    apply_filter_adjoint,
     compute_joint_motion,
     estimate_resolution,
 )
 from hydrotele.identify.record import (
     IdentificationRecord,
     check_periodicity,
-    cut_beginning,
     cut_to_whole_cycles,
+    keep_beginning,
 )
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import SmoothedSignal, smooth
+from hydrotele.identify.smoothing import SmoothedSignal, smooth_and_differentiate
 from hydrotele.identify.verdict import (
-    compare_with_given_forces,
+    assess_identification,
     compute_heldout_errors,
     compute_heldout_forces,
-    describe_heldout_errors,
-    describe_status,
+    describe_drives_at_rest,
     find_implausible_parameters,
+    find_wrong_force_columns,
     residual_autocorrelation,
 )
 from hydrotele.identify.wild_readings import remove_wild_readings
@@ -113,7 +113,7 @@ def propagate_noise(
         folded = on_force[first : first + _PARAMETERS_PER_BLOCK].reshape(-1, cycles, rows // cycles, k)
         # the sign of the error, measured minus modelled force, does not matter in a square
         on_motion = np.einsum("pcnk,xnkj->xpnj", folded, slopes, optimize=True)
-        parts.append(apply_adjoint(on_motion, record.period, position_resolution, processing))
+        parts.append(apply_filter_adjoint(on_motion, record.period, position_resolution, processing))
     on_position, stated = np.concatenate(parts), position_resolution.noise**2 / cycles
     return out + np.einsum("pnj,j,qnj->pq", on_position, stated, on_position, optimize=True)
 
@@ -217,7 +217,7 @@ def _simulate_record(
     if processing.method == "periodic":
         motion = compute_joint_motion(record.position, record.period, position_resolution, processing)
     else:
-        motion = smooth(record.position, record.period, position_resolution.noise)
+        motion = smooth_and_differentiate(record.position, record.period, position_resolution.noise)
     force = predict_forces(setup, np.stack([motion.value, motion.rate, motion.acceleration]), value)
     force[~np.isfinite(record.force)] = np.nan
     return replace(record, position=motion.value, force=force)
@@ -317,7 +317,7 @@ def identify_dynamics(
     Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
     """
     started, estimator = time.perf_counter(), estimator or Estimator()
-    fitted = fit_runs(fit, setup, processing or Processing(), estimator)
+    fitted = fit_base_parameters(fit, setup, processing or Processing(), estimator)
     data, told, found = fitted.data, fitted.data_identifiability, fitted.estimate
     bias = np.zeros(len(told.base))
     if _has_stated_noise(data):
@@ -342,20 +342,22 @@ def identify_dynamics(
     judged, _ = build_equations(heldout, setup, judging, resolved, with_noise=True)
     predicted = compute_heldout_errors(judged, table, value, data.drive_columns, setup)
     forces = compute_heldout_forces(judged, table, value)
-    found_friction = compute_friction_forces(setup, compute_speeds(fit, setup), table.names, value, told.base, found)
-    findings = (*compare_with_given_forces(forces, predicted), *find_implausible_parameters(told, table, found))
+    found_friction = compute_friction_forces(
+        setup, compute_drive_speeds(fit, setup), table.names, value, told.base, found
+    )
+    findings = (*find_wrong_force_columns(forces, predicted), *find_implausible_parameters(told, table, found))
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, data_identifiability=told,
         motion_identifiability=fitted.motion_identifiability, estimate=found, bias=bias, heldout=predicted,
         friction=found_friction, forces=forces, band=judged.band,
         residual_autocorrelation=dict(zip(data.drives, residual_autocorrelation(found.residual).tolist(), strict=True)),
-        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup, findings),
-        notes=(*notes, *data.notes, *findings, *describe_heldout_errors(predicted, heldout.name)),
+        status=assess_identification(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup, findings),
+        notes=(*notes, *data.notes, *findings, *describe_drives_at_rest(predicted, heldout.name)),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 
 
-def fit_runs(
+def fit_base_parameters(
     fit: Sequence[IdentificationRecord],
     setup: RegressorSetup,
     processing: Processing,
@@ -400,7 +402,7 @@ def fit_runs(
     resting = {joint for joint, stands in zip(setup.given_joints, still, strict=True) if stands}
     equations = weight_equations(data, structure, estimator.method, processing.period)
     told = find_identifiable_parameters(equations, structure, setup, resting, data.drives)
-    found = equations.estimate_base(told, estimator.ridge, estimator.truncation)
+    found = equations.estimate_base_parameters(told, estimator.ridge, estimator.truncation)
     return UncorrectedFit(data, processing, equations, structure, told, found, still)
 
 
@@ -488,7 +490,7 @@ def identify_with_friction_shapes(
     cleaned = [remove_wild_readings(record, setup.chain.drives) for record in (*fit, heldout)]
     fit, heldout = [record for record, _ in cleaned[:-1]], cleaned[-1][0]
     notes = (*notes, *(note for _, said in cleaned for note in said))
-    speeds = compute_speeds(fit, setup)
+    speeds = compute_drive_speeds(fit, setup)
     setup = set_rest_speeds(setup, speeds)
     some = _select_first_runs(fit, processing.period)
     best = compute_schwarz_criterion(some, setup, processing, estimator)
@@ -497,7 +499,7 @@ def identify_with_friction_shapes(
         if (criterion := compute_schwarz_criterion(some, sharp, processing, estimator)) < best:
             setup, best = sharp, criterion
             notes = (*notes, "Sharp Coulomb friction fits these data better than the given smoothing.")
-    free, wide = add_deviations(setup, speeds), _widen_band(fit, processing)
+    free, wide = add_low_speed_friction_deviations(setup, speeds), _widen_band(fit, processing)
     if wide != processing:
         best = compute_schwarz_criterion(some, setup, wide, estimator)
     if compute_schwarz_criterion(some, free, wide, estimator) < best:
@@ -522,7 +524,7 @@ def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None
     """Return the first runs up to a total length of about 600 s; a run longer than that is cut."""
     some, seconds = [], 0.0
     for record in fit:
-        some.append(cut_beginning(record, _SHAPE_SELECTION_DURATION_S, period))
+        some.append(keep_beginning(record, _SHAPE_SELECTION_DURATION_S, period))
         seconds += len(record.force) * record.period
         if seconds >= _SHAPE_SELECTION_DURATION_S:
             break
@@ -547,7 +549,7 @@ def compute_schwarz_criterion(
 
     Source: McQuarrie and Tsai 1998, Regression and time series model selection (correction for few rows).
     """
-    found = fit_runs(fit, setup, processing, estimator)
+    found = fit_base_parameters(fit, setup, processing, estimator)
     rows, drives = found.estimate.residual.shape
     parameters = len(found.estimate.value)
     if (free := rows - parameters / drives - 2.0) <= 0.0:

@@ -85,7 +85,7 @@ def find_consistent_parameters(
     counts = [piece.variable_count for piece in pieces]
     ends = np.cumsum([0, *counts])
 
-    def value_of(x: np.ndarray) -> np.ndarray:
+    def deformed_parameters(x: np.ndarray) -> np.ndarray:
         value = found.nominal.copy()
         for piece, a, b in zip(pieces, ends, ends[1:], strict=False):
             value[piece.places] = piece.inertial_parameters(x[a:b])
@@ -93,7 +93,7 @@ def find_consistent_parameters(
         return value
 
     def misfit(x: np.ndarray) -> np.ndarray:
-        away = base @ value_of(x) - wanted
+        away = base @ deformed_parameters(x) - wanted
         return np.concatenate([away, x[: ends[-1]] / _DEFORMATION_STD, 1e-3 * x[ends[-1] :]])
 
     low = np.full(ends[-1] + len(others), -np.inf)
@@ -104,7 +104,7 @@ def find_consistent_parameters(
     start = np.zeros(len(low))
     start[ends[-1] :] = np.maximum((found.value[others] - found.nominal[others]) / sizes, low[ends[-1] :])
     solved = least_squares(misfit, start, bounds=(low - 1e-9, np.inf))
-    value = value_of(np.maximum(solved.x, low))
+    value = deformed_parameters(np.maximum(solved.x, low))
     return ConsistentParameters(value, float(np.sum((base @ value - wanted) ** 2)))
 
 
@@ -202,14 +202,14 @@ def build_identified_machine(
     best = find_consistent_parameters(found, freedom)
     numbers = dict(zip(found.names, best.value, strict=True))
     for body in freedom:
-        machine = _with_body(machine, body, numbers, bars.get(body))
+        machine = _replace_body_inertia(machine, body, numbers, bars.get(body))
     for axis, facts in machine.axes.items():
         place = _friction_joint(found, facts.joint, axis)
         if place is None:
             continue
         drive = f"axes.{axis}.{'cylinder' if facts.cylinder else 'motor' if facts.motor else 'force'}"
-        machine = _with_friction(machine, f"{drive}.friction", place, numbers)
-        machine = _with_offset(machine, axis, place, found, numbers)
+        machine = _replace_friction(machine, f"{drive}.friction", place, numbers)
+        machine = _replace_force_offset(machine, axis, place, found, numbers)
     return machine, best
 
 
@@ -229,7 +229,7 @@ def _friction_joint(found: Identification, joint: str, axis: str) -> str | None:
     return None
 
 
-def _with_body(machine: Machine, body: str, numbers: dict, bar: tuple[str, str] | None) -> Machine:
+def _replace_body_inertia(machine: Machine, body: str, numbers: dict, bar: tuple[str, str] | None) -> Machine:
     mass = numbers[f"mass.{body}"]
     com = np.array([numbers[f"moment_{c}.{body}"] for c in "xyz"]) / mass
     about = [numbers[f"inertia_{c}{c}.{body}"] for c in "xyz"]
@@ -251,7 +251,7 @@ def _with_body(machine: Machine, body: str, numbers: dict, bar: tuple[str, str] 
     return machine
 
 
-def _with_friction(machine: Machine, path: str, place: str, numbers: dict) -> Machine:
+def _replace_friction(machine: Machine, path: str, place: str, numbers: dict) -> Machine:
     for kind, field in _FRICTION_FIELDS.items():
         if f"{kind}.{place}" in numbers:
             machine = with_value(machine, f"{path}.{field}", float(max(numbers[f"{kind}.{place}"], 0.0)))
@@ -264,7 +264,7 @@ def _with_friction(machine: Machine, path: str, place: str, numbers: dict) -> Ma
     return machine
 
 
-def _with_offset(machine: Machine, axis: str, place: str, found: Identification, numbers: dict) -> Machine:
+def _replace_force_offset(machine: Machine, axis: str, place: str, found: Identification, numbers: dict) -> Machine:
     name = f"offset.{place}"
     if name not in numbers:
         return machine
@@ -277,7 +277,7 @@ def _with_offset(machine: Machine, axis: str, place: str, found: Identification,
         return with_value(machine, f"axes.{axis}.force.offset", float(numbers[name]))
     channel = f"pressure_head.{axis}"
     known = machine.sensor_errors.get(channel, SensorError())
-    more = numbers[name] / facts.hydraulic_drive.areas[0] * known.scale
+    more = numbers[name] / facts.hydraulic_drive.effective_areas[0] * known.scale
     error = known.model_copy(update={"offset": float(known.offset + more)})
     return machine.model_copy(update={"sensor_errors": {**machine.sensor_errors, channel: error}})
 

@@ -27,7 +27,7 @@ from hydrotele.logs.log import SKIP_COLUMN, Log, find_logs, load_log
 from hydrotele.logs.rows import fit_clock
 from hydrotele.logs.table import read_table
 from hydrotele.machine.machine import SensorError
-from hydrotele.machine.signals import close_matches
+from hydrotele.machine.signals import suggest_channel_names
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import solve_joint_positions
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
@@ -209,7 +209,7 @@ def load_mechanism_records(
         if name in runs:
             raise InputError(log.source, f"the run name {name!r} is used twice: rename one")
         run, said = _build_record(log, name, columns, mechanism)
-        runs[name] = run if keep_measured_joints else convert_coordinates(run, mechanism.setup)
+        runs[name] = run if keep_measured_joints else convert_to_given_joints(run, mechanism.setup)
         notes += [*log.notes, *said]
     if heldout is not None and heldout not in runs:
         raise InputError("--heldout", f"there is no run {heldout!r}; {suggest_valid_name(heldout, runs)}")
@@ -247,7 +247,7 @@ def _load_with_columns(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tupl
     names, ours = raw.names, "hydrotele" in raw.metadata  # logs of hydrotele keep their names
     aliases = dict.fromkeys(names, SKIP_COLUMN)
     if mapping.time not in names:
-        hint = next((f" {name}" for name in names if "time" in close_matches(name)[:1]), "")
+        hint = next((f" {name}" for name in names if "time" in suggest_channel_names(name)[:1]), "")
         raise InputError(path, f"has no time column {mapping.time!r}: name it in the"
                          f" mapping, as `time:{hint or ' COLUMN'}`; columns: {', '.join(names)}")  # fmt: skip
     aliases[mapping.time] = "time"
@@ -302,7 +302,7 @@ def _build_record(
         apart = np.diff(time[known], prepend=time[known][0])[after.clip(0, known.sum() - 1)]
         return np.where(apart > MAX_GAP_S, np.nan, out)
 
-    def values_of(what: str, joint: str) -> np.ndarray | None:
+    def read_corrected_column(what: str, joint: str) -> np.ndarray | None:
         column = columns.get((what, joint))
         if column is None:
             return None
@@ -311,13 +311,13 @@ def _build_record(
 
     position = []
     for joint in mechanism.measured_joints:
-        if (values := values_of("position", joint)) is None:
+        if (values := read_corrected_column("position", joint)) is None:
             raise InputError(
                 log.source, f"has no column for the position of {joint}: name it in the mapping, as"
                 f" `position: {{{joint}: COLUMN}}`",
             )  # fmt: skip
         position.append(interpolate_values(values))
-    force = [interpolate_values(values_of("force", drive)) for drive in chain.drives]
+    force = [interpolate_values(read_corrected_column("force", drive)) for drive in chain.drives]
     if not np.isfinite(force).any():
         raise InputError(
             log.source, "has no column of a drive force: name the columns in the mapping, as"
@@ -339,7 +339,7 @@ def _expand_noise(stated: float | dict[str, float] | None, joints: Sequence[str]
     return np.full(len(joints), np.nan if stated is None else stated)
 
 
-def convert_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
+def convert_to_given_joints(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
     """Convert a record's measured joint positions to the joints that describe the motion in a setup.
 
     Args:

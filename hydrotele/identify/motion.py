@@ -18,7 +18,7 @@ from hydrotele.identify.smoothing import (
     check_period,
     expand_per_column,
     filter_zero_phase,
-    smooth,
+    smooth_and_differentiate,
 )
 from hydrotele.multibody.inverse_dynamics import Projection
 
@@ -193,7 +193,7 @@ def estimate_resolution(positions: np.ndarray, period: float, noise: np.ndarray,
 
     Source: Wiener filter of an integrator chain in white noise.
     """
-    smoothed = smooth(positions, period, _stated_noise(noise))
+    smoothed = smooth_and_differentiate(positions, period, _stated_noise(noise))
     ratio = math.sqrt(cycles) * smoothed.input_std / smoothed.noise
     halves = ratio ** (1.0 / smoothed.order) / (2.0 * math.pi)
     moves = np.nanstd(smoothed.value, axis=0) > _MIN_MOTION_OVER_NOISE * smoothed.noise
@@ -226,16 +226,16 @@ def compute_joint_motion(
         InputError: the method cannot be used with these positions.
     """
     if processing.method == "optimal":
-        return smooth(positions, period, position_resolution.noise)
+        return smooth_and_differentiate(positions, period, position_resolution.noise)
     moving = _apply_linear_filter(positions, period, position_resolution, processing, position_resolution.noise)
     if position_resolution.is_moving.all():
         return moving
     return _replace_resting_joints(
-        moving, smooth(positions, period, position_resolution.noise), position_resolution.is_moving
+        moving, smooth_and_differentiate(positions, period, position_resolution.noise), position_resolution.is_moving
     )
 
 
-def apply_adjoint(
+def apply_filter_adjoint(
     gain: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
 ) -> np.ndarray:
     """Convert gains on filtered positions, rates and accelerations to gains on measured positions.

@@ -14,7 +14,7 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
 from hydrotele.kinematics.linkages import LoopOpenError
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
+from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
 
 _ERROR_CONTEXT = "identification"
 _MAX_CYCLE_DRIFT_ROWS = 0.5  # rows, largest shift of a cycle against the rows over a whole record
@@ -106,15 +106,15 @@ def compute_force_noise(machine: Machine, sensors: str) -> np.ndarray:
     Raises:
         InputError: the machine has no such sensor set.
     """
-    known, out = get_sensors(machine, sensors), []
+    known, out = get_sensor_set(machine, sensors), []
     for axis in actuator_order(machine):
         facts = machine.axes[axis]
         if facts.force:
             out.append(0.0)
             continue
-        sides = zip(facts.hydraulic_drive.areas, ("head", "rod"), strict=True)
+        sides = zip(facts.hydraulic_drive.effective_areas, ("head", "rod"), strict=True)
         out.append(float(np.linalg.norm(
-            [area * noise_rms(machine, known, f"pressure_{side}.{axis}") for area, side in sides]
+            [area * reading_noise_rms(machine, known, f"pressure_{side}.{axis}") for area, side in sides]
         )))  # fmt: skip
     return np.array(out)
 
@@ -170,12 +170,14 @@ def check_periodicity(record: IdentificationRecord, period: float, noise: np.nda
             )  # fmt: skip
 
 
-def cut_beginning(record: IdentificationRecord, seconds: float, period: float | None = None) -> IdentificationRecord:
-    """Keep only the first part of a record, at most `seconds` long.
+def keep_beginning(
+    record: IdentificationRecord, max_duration: float, period: float | None = None
+) -> IdentificationRecord:
+    """Keep only the first part of a record, at most `max_duration` long.
 
     Args:
         record: the record.
-        seconds: largest length of the part [s].
+        max_duration: largest length of the part [s].
         period: period of the motion, of which a whole number is kept [s]; None for any length.
 
     Returns:
@@ -185,8 +187,8 @@ def cut_beginning(record: IdentificationRecord, seconds: float, period: float | 
         InputError: a position has no valid sample in this part.
     """
     if period:
-        seconds = max(1.0, seconds // period) * period
-    rows = round(seconds / record.period)
+        max_duration = max(1.0, max_duration // period) * period
+    rows = round(max_duration / record.period)
     if rows >= len(record.force):
         return record
     return trim_missing_positions(replace(record, position=record.position[:rows], force=record.force[:rows]))
@@ -238,7 +240,7 @@ def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.nda
     machine = dataset.machine
     values, noises = [], []
     for channel in _position_channels(dataset, axis):
-        reading, noise = _correct_reading(dataset, run, channel)
+        reading, noise = _read_corrected_channel(dataset, run, channel)
         if not np.isfinite(reading).any():
             continue
         if channel.startswith("length."):
@@ -295,12 +297,12 @@ def _compute_force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarra
         rows = np.arange(len(command)) - facts.command_delay / run.period
         late = np.maximum(np.floor(rows + 1e-9), 0.0).astype(int)
         return np.where(run.command_known, facts.force.gain * command, np.nan)[late], 0.0
-    (head, noise_head), (rod, noise_rod) = (_correct_reading(dataset, run, c) for c in channels)
-    area_head, area_rod = facts.hydraulic_drive.areas
+    (head, noise_head), (rod, noise_rod) = (_read_corrected_channel(dataset, run, c) for c in channels)
+    area_head, area_rod = facts.hydraulic_drive.effective_areas
     return area_head * head - area_rod * rod, float(np.hypot(area_head * noise_head, area_rod * noise_rod))
 
 
-def _correct_reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
+def _read_corrected_channel(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
     """Return a channel's readings (n,) corrected for the machine's known sensor errors, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())

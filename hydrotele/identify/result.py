@@ -14,7 +14,7 @@ from hydrotele.identify.identifiability import (
     STATUS_WEAK,
     Identifiability,
 )
-from hydrotele.multibody.inverse_dynamics import is_deviation
+from hydrotele.multibody.inverse_dynamics import is_friction_deviation
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Identification:
             true parameters lie.
         """
         told = self.data_identifiability
-        kept = np.array([not is_deviation(self.names[b]) for b in told.base])
+        kept = np.array([not is_friction_deviation(self.names[b]) for b in told.base])
         estimate = replace(
             self.estimate, value=self.estimate.value[kept], covariance=self.estimate.covariance[np.ix_(kept, kept)],
             rank=min(self.estimate.rank, int(kept.sum())),
@@ -184,7 +184,7 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
     given = found.data_identifiability.combination @ found.nominal
     rows = []
     for m, name in enumerate(found.names):
-        if is_deviation(name):
+        if is_friction_deviation(name):
             continue
         status, unit, nominal = (
             found.data_identifiability.status[m],

@@ -92,7 +92,7 @@ class RegressorSetup:
     zero_parameters: tuple[str, ...] = ()
     moment_free: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
-    def project(
+    def project_motion_on_drives(
         self, position: np.ndarray, rate: np.ndarray, acceleration: np.ndarray,
         start: np.ndarray | None = None,
     ) -> Projection:  # fmt: skip
@@ -190,7 +190,7 @@ def machine_setup(
     Source: Khoshzaban 1992, 4.3 (complete and reduced model) and p. 92, Eq. 4.23 (ball joints).
     """
     moved = [b for k, b in enumerate(chain.bodies) if chain.tree.is_moved[k + 1].any()]
-    bodies = tuple(b for b in moved if model == "complete" or b not in cylinder_bars(machine))
+    bodies = tuple(b for b in moved if model == "complete" or b not in map_cylinder_bodies(machine))
     rubbing = drive_friction_terms(machine, chain)
     if asymmetry:
         rubbing = [replace(r, nominal={"viscous_asymmetry": 0.0, **r.nominal}) for r in rubbing]
@@ -203,11 +203,11 @@ def machine_setup(
     return RegressorSetup(
         chain=chain, given_joints=tuple(machine.axes[a].joint for a in order), bodies=bodies,
         friction_terms=(*rubbing, *(passive_friction_terms(chain) if pins else ())), offsets=offsets,
-        moment_free=dict.fromkeys(cylinder_bars(machine), _BAR_AXIS) if ball_joints else {},
+        moment_free=dict.fromkeys(map_cylinder_bodies(machine), _BAR_AXIS) if ball_joints else {},
     )  # fmt: skip
 
 
-def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
+def map_cylinder_bodies(machine: Machine) -> dict[str, tuple[str, str]]:
     """Return body name -> (axis, `tube` or `rod`) for the tubes and rods of all cylinders."""
     return {
         f"{name}_{part}": (name, part)

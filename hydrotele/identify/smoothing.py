@@ -1,6 +1,6 @@
 """Smoothing and differentiation of noisy samples by an optimal smoother or a zero-phase filter.
 
-`smooth` models the signal as a chain of m integrators driven by white noise, after Trujillo and
+`smooth_and_differentiate` models the signal as a chain of m integrators driven by white noise, after Trujillo and
 Busby. Its only free parameter, the variance of the input, follows from the data by maximum
 likelihood or generalised cross-validation. `filter_zero_phase` runs a Butterworth filter forwards and
 backwards and differentiates by central differences.
@@ -196,7 +196,7 @@ def _congruence_transform(info, matrix, order, work, out):
 
 
 @compiled
-def _is_stationary(old, new, order):
+def _has_converged(old, new, order):
     for i in range(order):
         if abs(new[i, i] - old[i, i]) > _STATIONARITY_TOLERANCE * abs(new[i, i]):
             return False
@@ -204,7 +204,7 @@ def _is_stationary(old, new, order):
 
 
 @compiled
-def backward_pass(known, ratio, order, infos, gains, totals):
+def compute_backward_information(known, ratio, order, infos, gains, totals):
     """Compute, backwards in time, the information about each state from its own and all later samples.
 
     It depends on which samples are known, but not on their values.
@@ -238,13 +238,13 @@ def backward_pass(known, ratio, order, infos, gains, totals):
         gains[j], totals[j] = column, total
         _congruence_transform(info, forward, order, work, out)
         out[0, 0] += known[j]
-        settled = _is_stationary(infos[j + 1], out, order)
+        settled = _has_converged(infos[j + 1], out, order)
         info[:] = out
         infos[j] = out
 
 
 @compiled
-def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
+def smooth_states(samples, known, variance_ratio, order, infos, gains, totals, states):
     """Compute the smoothed states of a column, and the terms of its log likelihood.
 
     The states minimise sum (d - c[0])^2 + (1/r) sum g^2 over samples d, states c and inputs g.
@@ -252,7 +252,7 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
     Args:
         samples: (n,) samples over the noise standard deviation [1]; any value where missing.
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
-        ratio: r, scalar [1].
+        variance_ratio: r, scalar [1].
         order: number m of integrators [1].
         infos: (n, m, m) work space.
         gains: (n, m) work space.
@@ -265,7 +265,7 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
 
     Source: Trujillo and Busby 1983.
     """
-    backward_pass(known, ratio, order, infos, gains, totals)
+    compute_backward_information(known, variance_ratio, order, infos, gains, totals)
     forward, _, drive = transition_matrices(order)
     count = len(samples)
     pulls = np.zeros((count, order))  # information vectors of samples j .. n-1
@@ -294,8 +294,8 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
             value += drive[i] * pulls[j + 1, i] / totals[j]
         for i in range(order):
             states[j + 1, i] = rest[i] + drive[i] * value
-        inputs += value * value / ratio
-        logs += math.log(totals[j] * ratio)
+        inputs += value * value / variance_ratio
+        logs += math.log(totals[j] * variance_ratio)
     residuals = 0.0
     for j in range(count):
         if known[j] > 0.0:
@@ -314,7 +314,7 @@ def state_variances(known, ratio, order, infos, variances):
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
         ratio: r, scalar [1].
         order: number m of integrators [1].
-        infos: (n, m, m) information of samples j .. n-1 about state j, from `backward_pass`.
+        infos: (n, m, m) information of samples j .. n-1 about state j, from `compute_backward_information`.
         variances: (n, m) written [1].
 
     Returns:
@@ -327,7 +327,7 @@ def state_variances(known, ratio, order, infos, variances):
     info, work, out = np.zeros((order, order)), np.zeros((order, order)), np.zeros((order, order))
     column, old, settled = np.zeros(order), np.zeros((order, order)), False
     for j in range(len(known)):
-        if not (settled and j > 0 and _is_stationary(infos[j - 1], infos[j], order)):
+        if not (settled and j > 0 and _has_converged(infos[j - 1], infos[j], order)):
             inverse = np.linalg.inv(info + infos[j])
             for i in range(order):
                 variances[j, i] = inverse[i, i]
@@ -339,7 +339,7 @@ def state_variances(known, ratio, order, infos, variances):
         info[0, 0] += known[j]
         _marginalise_input(info, against, ratio, order, column)
         _congruence_transform(info, back, order, work, out)
-        settled = _is_stationary(old, out, order)
+        settled = _has_converged(old, out, order)
         info[:] = out
 
 
@@ -355,7 +355,7 @@ _SMOOTHER_CONTEXT = "optimal smoother"
 
 @dataclass(frozen=True)
 class OptimallySmoothed(SmoothedSignal):
-    """Signals smoothed by `smooth`, with the parameters of the smoother.
+    """Signals smoothed by `smooth_and_differentiate`, with the parameters of the smoother.
 
     Attributes:
         noise: (k,) standard deviation of one sample, given or estimated [u].
@@ -372,7 +372,7 @@ class OptimallySmoothed(SmoothedSignal):
     known: np.ndarray
 
 
-def smooth(
+def smooth_and_differentiate(
     values: np.ndarray,
     period: float,
     noise: float | np.ndarray | None = None,
@@ -411,7 +411,7 @@ def smooth(
     >>> import numpy as np
     >>> time = 0.02 * np.arange(200)
     >>> noisy = np.sin(time) + np.random.default_rng(1).normal(0.0, 1e-3, 200)
-    >>> found = smooth(noisy, 0.02, noise=1e-3)
+    >>> found = smooth_and_differentiate(noisy, 0.02, noise=1e-3)
     >>> bool(np.abs(found.rate - np.cos(time)).max() < 0.01)
     True
     """
@@ -451,7 +451,7 @@ def smooth(
     )  # fmt: skip
 
 
-def sample_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
+def sample_smoothing_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
     """Draw random errors (smoothed minus true) that smoothed signals may have.
 
     A signal of the integrator chain with input `input_std` is simulated, noise is added, and the
@@ -459,7 +459,7 @@ def sample_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.
     depend on the measured signal.
 
     Args:
-        smoothed: result of `smooth`.
+        smoothed: result of `smooth_and_differentiate`.
         count: number of samples [1].
         seed: seed of the random generator [1].
 

@@ -24,7 +24,7 @@ _POSITIVE_PARAMETERS = ("mass", "inertia_xx", "inertia_yy", "inertia_zz", "drive
 def compute_heldout_errors(
     equations: Equations,
     table: Regressor,
-    value: np.ndarray,
+    parameters: np.ndarray,
     columns: list[int],
     setup: RegressorSetup,
 ) -> dict[str, HeldOutError]:
@@ -33,21 +33,21 @@ def compute_heldout_errors(
     Args:
         equations: equations of the held-out run.
         table: names, units and nominal values of the m parameters.
-        value: (m,) identified parameters.
+        parameters: (m,) identified parameters.
         columns: indices of the drives whose force is known in the fitted runs.
         setup: definition of the regressor.
 
     Returns:
         Drive -> errors. Drives without known forces are omitted.
     """
-    noise, out = equations.noise_rms(value), {}
-    numbers = dict(zip(table.names, value, strict=True))
+    noise, out = equations.noise_rms(parameters), {}
+    numbers = dict(zip(table.names, parameters, strict=True))
     for k in columns:
         known, drive = np.isfinite(equations.force[:, k]), table.drives[k]
         if not known.any():
             continue
         force = equations.force[known, k]
-        error, given = (force - equations.matrix[known, k] @ p for p in (value, table.nominal))
+        error, given = (force - equations.matrix[known, k] @ p for p in (parameters, table.nominal))
         rest = equations.friction_sign_uncertainty[known, k]
         friction = max(float(numbers.get(f"coulomb.{drive}", 0.0)), 0.0)
         at_rest = rest > _MIN_REST_UNCERTAINTY
@@ -92,7 +92,7 @@ def compute_heldout_forces(equations: Equations, table: Regressor, value: np.nda
     )  # fmt: skip
 
 
-def compare_with_given_forces(forces: HeldOutForces, heldout: dict[str, HeldOutError]) -> tuple[str, ...]:
+def find_wrong_force_columns(forces: HeldOutForces, heldout: dict[str, HeldOutError]) -> tuple[str, ...]:
     """Find measured forces with a wrong sign or unit by comparison with those of the given model.
 
     Args:
@@ -151,7 +151,7 @@ def find_implausible_parameters(identifiability: Identifiability, table: Regress
     return tuple(notes)
 
 
-def describe_heldout_errors(heldout: dict[str, HeldOutError], run: str) -> tuple[str, ...]:
+def describe_drives_at_rest(heldout: dict[str, HeldOutError], run: str) -> tuple[str, ...]:
     """Return notes on drives that are at rest in the held-out run.
 
     Args:
@@ -173,7 +173,7 @@ def residual_autocorrelation(residual: np.ndarray) -> np.ndarray:
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
 
-def describe_status(
+def assess_identification(
     heldout: dict[str, HeldOutError],
     fitted: dict[str, float],
     resting: np.ndarray,

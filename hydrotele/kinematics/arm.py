@@ -77,13 +77,13 @@ def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float
     >>> [round(v, 4) for v in forward_kinematics(cat215, (0.0, math.radians(27.8), math.radians(-80.6), 0.0))]
     [6.0114, -0.0183, 0.9821, -0.9215]
     """
-    x, z = _plane_chain(geometry, q)[0]
+    x, z = _plane_point_and_derivatives(geometry, q)[0]
     r, theta = math.hypot(x, geometry.lateral_offset), q[0] + math.atan2(geometry.lateral_offset, x)
     z += geometry.boom_pin_height
     return (r, theta, z, q[1] + q[2] + q[3]) if geometry.has_tool_joint else (r, theta, z)
 
 
-def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
+def forward_kinematics_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
     """Compute the Cartesian position of the arm's controlled point from its joint angles (Zhu Eq. 2.2).
 
     (x, y) = Rot(q1) (x of the arm plane, d2).
@@ -98,10 +98,10 @@ def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float,
     >>> cat215 = ArmGeometry(
     ...     base_radius=0.340, lateral_offset=-0.110, boom_length=5.180, stick_length=1.800
     ... )
-    >>> [round(v, 4) for v in forward_cartesian(cat215, (math.pi / 2, 0.0, -math.pi / 2, 0.0))]
+    >>> [round(v, 4) for v in forward_kinematics_cartesian(cat215, (math.pi / 2, 0.0, -math.pi / 2, 0.0))]
     [0.11, 5.52, -1.8]
     """
-    x, z = _plane_chain(geometry, q)[0]
+    x, z = _plane_point_and_derivatives(geometry, q)[0]
     cosine, sine, y = math.cos(q[0]), math.sin(q[0]), geometry.lateral_offset
     return cosine * x - sine * y, sine * x + cosine * y, z + geometry.boom_pin_height
 
@@ -181,7 +181,7 @@ def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
     >>> jacobian(cat215, (0.0, 0.0, -math.pi / 2, 0.0)).round(4)[:, 1]
     array([1.7996, 0.0065, 5.18  , 1.    ])
     """
-    (x, _), dx, dz = _plane_chain(geometry, q)
+    (x, _), dx, dz = _plane_point_and_derivatives(geometry, q)
     square = x * x + geometry.lateral_offset * geometry.lateral_offset
     radial, turning = x / math.sqrt(square), -geometry.lateral_offset / square
     rows = [[0.0, *(radial * v for v in dx)], [1.0, *(turning * v for v in dx)], [0.0, *dz]]
@@ -208,7 +208,7 @@ def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
            [5.52, 0.  ],
            [0.  , 5.18]])
     """
-    (x, _), dx, dz = _plane_chain(geometry, q)
+    (x, _), dx, dz = _plane_point_and_derivatives(geometry, q)
     cosine, sine, y = math.cos(q[0]), math.sin(q[0]), geometry.lateral_offset
     return np.array(
         [
@@ -219,7 +219,7 @@ def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
     )
 
 
-def _plane_chain(
+def _plane_point_and_derivatives(
     geometry: ArmGeometry, q: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Compute the controlled point in the arm's vertical plane, and its derivatives.

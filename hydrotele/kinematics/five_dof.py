@@ -146,7 +146,7 @@ def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolut
     return JointSolution((_wrap_angle(swing), boom, stick, tilt, pose.head), near or found.is_clamped)
 
 
-def inverse_for_direction(
+def inverse_kinematics_for_direction(
     geometry: FellerGeometry, position: Sequence[float], direction: Sequence[float]
 ) -> tuple[JointSolution, ...]:
     """Compute all joint angles for a tool position and a direction of its X axis.

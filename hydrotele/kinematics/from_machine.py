@@ -125,7 +125,7 @@ def has_ball_ends(machine: Machine, name: str) -> bool:
     return isinstance(linkage, TwoBar) and abs(linkage.axial_offset) > _GEOMETRY_TOLERANCE
 
 
-def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
+def joint_range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
     """Convert the range of an axis' joint to the range of its drive, such as piston displacement.
 
     Args:
@@ -164,7 +164,7 @@ def drive_travel(machine: Machine, name: str) -> tuple[float, float] | None:
     Returns:
         (low, high) of the drive's coordinate [m] or [rad]; None if it is unlimited.
     """
-    cylinder, limits = machine.axes[name].cylinder, range_at_drive(machine, name)
+    cylinder, limits = machine.axes[name].cylinder, joint_range_at_drive(machine, name)
     if cylinder is None:
         return limits
     low, high = limits or (0.0, cylinder.stroke)
@@ -318,14 +318,14 @@ def tip_position(machine: Machine, joints: np.ndarray) -> np.ndarray:
     return place
 
 
-def solve_tip_position(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
+def solve_joints_for_tip(machine: Machine, tip: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Compute swing, boom and stick angle for a tip position, for any joint axes, by Newton's method.
 
     It takes at most 8 steps; convergence is not checked.
 
     Args:
         machine: a machine with an `arm` of three joints.
-        place: (3,) position of the tip [m].
+        tip: (3,) position of the tip [m].
         start: (3,) swing, boom and stick near the solution [rad].
 
     Returns:
@@ -333,7 +333,7 @@ def solve_tip_position(machine: Machine, place: np.ndarray, start: np.ndarray) -
     """
     joints, step = np.array(start, float), 1.0e-6
     for _ in range(8):
-        gap = tip_position(machine, joints) - place
+        gap = tip_position(machine, joints) - tip
         if np.abs(gap).max() < _GEOMETRY_TOLERANCE:
             break
         slope = np.column_stack([

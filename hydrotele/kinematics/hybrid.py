@@ -228,7 +228,7 @@ def build_hybrid(facts: HybridSpec) -> HybridRobot:
         table = np.array([(r.theta, r.d, r.a, r.alpha) for r in facts.carriage])
         constants = np.concatenate([np.eye(4)[None], dh_transform(*table.T)])
     else:
-        constants = constants_from_axes(axis_frames(facts.axes), _platform_at_zero(facts))
+        constants = carriage_constants_from_axes(axis_frames(facts.axes), _platform_at_zero(facts))
     return HybridRobot(
         facts.name, tuple(r.joint for r in rows), np.array([_KIND_CODES[r.kind] for r in rows]),
         constants, np.array(facts.universal_joints), np.array(facts.spherical_joints),
@@ -281,7 +281,7 @@ def _platform_at_zero(facts: HybridSpec) -> np.ndarray:
     return frame
 
 
-def constants_from_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
+def carriage_constants_from_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
     """Compute the constant transforms between the joints of a carriage that is given by its axes.
 
     With these C_0 to C_n the pose is C_0 M(q_1) C_1 ... C_n, with motions M about or along z.
@@ -308,7 +308,7 @@ def inverse_transform(transform: np.ndarray) -> np.ndarray:
     return result
 
 
-def zero_frames(robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
+def frames_at_zero_joints(robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
     """Compute the frames of joint axes and connecting platform in frame 0 with all joints at zero.
 
     Returns:
@@ -331,7 +331,7 @@ def convert_to_axes(robot: HybridRobot) -> HybridRobot:
     >>> bool(abs(change).max() < 1e-12)
     True
     """
-    frames, last = zero_frames(robot)
+    frames, last = frames_at_zero_joints(robot)
     rows = [
         AxisRow(joint=name, kind="prismatic" if kind == PRISMATIC else "revolute",
                 direction=tuple(frame[:3, 2]), point=tuple(frame[:3, 3]), range=tuple(limits))
@@ -509,7 +509,7 @@ def forward_kinematics(
     return pose
 
 
-def forward_by_evolution(
+def forward_kinematics_by_evolution(
     robot: HybridRobot, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
     reach: float = 0.35, turn: float = 0.6, polish: bool = False,
 ) -> PlatformPose:  # fmt: skip
@@ -534,14 +534,14 @@ def forward_by_evolution(
     """
     home = home_pose(robot, np.asarray(joints, float))
 
-    def pose_of(x: np.ndarray) -> PlatformPose:  # (6, S) as SciPy passes a population
+    def pose_from_vector(x: np.ndarray) -> PlatformPose:  # (6, S) as SciPy passes a population
         turned = Rotation.from_rotvec(x[3:].T).as_matrix() @ home.rotation
         return PlatformPose(turned, home.position + x[:3].T)
 
     def squared_errors(x: np.ndarray) -> np.ndarray:
         x = x if x.ndim == 2 else x[:, None]
         place = np.broadcast_to(joints, (x.shape[1], len(robot.joints)))
-        away = leg_readings(robot, place, pose_of(x)) - readings
+        away = leg_readings(robot, place, pose_from_vector(x)) - readings
         return np.sum((1e3 * away) ** 2, axis=-1)
 
     found = differential_evolution(
@@ -549,7 +549,7 @@ def forward_by_evolution(
         popsize=10, maxiter=2000, tol=1e-16, polish=polish, vectorized=True,
         updating="deferred",
     )  # fmt: skip
-    pose = pose_of(found.x[:, None])
+    pose = pose_from_vector(found.x[:, None])
     return PlatformPose(pose.rotation[0], pose.position[0])
 
 
@@ -701,7 +701,7 @@ class ErrorModel:
         return np.array([self.names.index(name) for name in names], int)
 
     @property
-    def carriage_count(self) -> int:
+    def carriage_parameter_count(self) -> int:
         """Number of carriage parameters; the 42 parameters of the legs follow."""
         return len(self.names) - 7 * LEG_COUNT
 
@@ -756,11 +756,11 @@ def refined_model_parameters(model: ErrorModel) -> tuple[str, ...]:
     carriage parameters with coordinates of A_i only. That of Fig. 18 (36 parameters) names a4,
     theta4, b1x, b6z.
     """
-    legs = model.names[model.carriage_count :]
-    return model.names[: model.carriage_count] + tuple(n for n in legs if n[0] != "a")
+    legs = model.names[model.carriage_parameter_count :]
+    return model.names[: model.carriage_parameter_count] + tuple(n for n in legs if n[0] != "a")
 
 
-def build_geometries(model: ErrorModel, errors: np.ndarray) -> GeometryBatch:
+def add_errors_to_geometry(model: ErrorModel, errors: np.ndarray) -> GeometryBatch:
     """Add sets of errors to a robot's nominal geometry: carriage, leg joints and leg offsets.
 
     Args:
@@ -771,7 +771,7 @@ def build_geometries(model: ErrorModel, errors: np.ndarray) -> GeometryBatch:
         The arguments of `batch_readings`.
     """
     errors = np.atleast_2d(errors)
-    robot, count = model.nominal, model.carriage_count
+    robot, count = model.nominal, model.carriage_parameter_count
     of_carriage = errors[:, :count]
     constants = _dh_constants if model.kind == "dh" else _poe_constants
     legs = errors[:, count:]
@@ -798,7 +798,7 @@ def predict_leg_readings(
     Returns:
         (W, N, 6) readings [m].
     """
-    parts = build_geometries(model, errors)
+    parts = add_errors_to_geometry(model, errors)
     return batch_readings(
         parts.constants, model.nominal.kinds, parts.universal, parts.spherical, parts.offsets,
         np.ascontiguousarray(joints), np.ascontiguousarray(rotation),
@@ -806,7 +806,7 @@ def predict_leg_readings(
     )  # fmt: skip
 
 
-def apply_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
+def apply_geometry_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
     """Return a robot with given errors: a calibrated robot, or the true robot of a simulation.
 
     Args:
@@ -817,21 +817,21 @@ def apply_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
         A robot of the same form, D-H rows for `dh`, axes for `poe`.
     """
     errors = np.asarray(errors, float)
-    robot, parts = model.nominal, build_geometries(model, errors)
+    robot, parts = model.nominal, add_errors_to_geometry(model, errors)
     changes: dict = {
         "universal_joints": _to_point_tuples(parts.universal[0]),
         "spherical_joints": _to_point_tuples(parts.spherical[0]),
         "leg_offsets": tuple(parts.offsets[0].tolist()),
     }
     if model.kind == "dh":
-        table = _dh_error_table(robot, errors[None, : model.carriage_count])[0]
+        table = _dh_error_table(robot, errors[None, : model.carriage_parameter_count])[0]
         changes["carriage"] = tuple(
             row.model_copy(update={part: getattr(row, part) + float(e)
                                    for part, e in zip(_DH_PARTS, extra, strict=True)})
             for row, extra in zip(robot.specification.carriage, table, strict=True)
         )  # fmt: skip
     else:
-        frames = _poe_frames(robot, errors[None, : model.carriage_count])[0]
+        frames = _poe_frames(robot, errors[None, : model.carriage_parameter_count])[0]
         changes["axes"] = tuple(
             row.model_copy(update={"direction": tuple(frame[:3, 2].tolist()),
                                    "point": tuple(frame[:3, 3].tolist())})
@@ -920,5 +920,5 @@ def _poe_frames(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
 
 
 def _poe_constants(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
-    at_zero = zero_frames(robot)[1]
-    return constants_from_axes(_poe_frames(robot, errors), at_zero)
+    at_zero = frames_at_zero_joints(robot)[1]
+    return carriage_constants_from_axes(_poe_frames(robot, errors), at_zero)

@@ -95,7 +95,7 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
     90.0
     """
     low, high = abs(left - right), left + right
-    opposite = clip_to_bars(opposite, low, high, "pin-to-pin length")
+    opposite = clip_to_reachable_length(opposite, low, high, "pin-to-pin length")
     m = math_module(opposite)
     sine, cosine = (opposite - low) * (opposite + low), (high - opposite) * (high + opposite)
     return 2 * m.atan2(m.sqrt(sine), m.sqrt(cosine))
@@ -127,14 +127,14 @@ def intersect_bars(first_pin: Point, second_pin: Point, first_bar: Scalar, secon
     square = way_x * way_x + way_z * way_z
     m = math_module(square)
     low, high = abs(first_bar - second_bar), first_bar + second_bar
-    distance = clip_to_bars(m.sqrt(square), low, high, "distance of the pins that two bars join")
+    distance = clip_to_reachable_length(m.sqrt(square), low, high, "distance of the pins that two bars join")
     flat = (distance - low) * (distance + low) * (high - distance) * (high + distance)
     along = 0.5 * (1 + (first_bar - second_bar) * high / square)
     beside = side * math_module(flat).sqrt(flat) / (2 * square)
     return first_pin[0] + along * way_x - beside * way_z, first_pin[1] + along * way_z + beside * way_x
 
 
-def clip_to_bars(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Scalar:
+def clip_to_reachable_length(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Scalar:
     """Clip a length to the range that two bars allow; raise an error if it exceeds that by 1e-12 m.
 
     Args:
@@ -149,7 +149,7 @@ def clip_to_bars(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Sca
     Raises:
         LoopOpenError: a length is outside [low, high] or NaN.
 
-    >>> clip_to_bars(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
+    >>> clip_to_reachable_length(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
     2.0
     """
     inside = (value >= low - 1e-12) & (value <= high + 1e-12)
@@ -467,7 +467,7 @@ class FourBar:
         m = math_module(length)
         rod_side, arm_side = self._branch_signs
         ground = math.dist(self.rocker_pivot, self.cylinder_base)
-        clip_to_bars(length, abs(ground - self.rocker), ground + self.rocker, "cylinder length")
+        clip_to_reachable_length(length, abs(ground - self.rocker), ground + self.rocker, "cylinder length")
         r = intersect_bars(self.rocker_pivot, self.cylinder_base, self.rocker, length, rod_side)
         q = intersect_bars(self.output_pivot, r, math.hypot(*self.output_arm), self.coupler, arm_side)
         turned = (

@@ -132,7 +132,7 @@ def chain_poses(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray |
     return ChainPoses(position, rotation)
 
 
-def chain_poses_and_rates(
+def chain_poses_and_derivatives(
     chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None
 ) -> PosesAndRates:
     """Compute poses of the chain's end, and their derivatives by constants and joint coordinates.
@@ -150,7 +150,7 @@ def chain_poses_and_rates(
         n poses and their derivatives.
 
     >>> arm = SerialChain(("a",), (Element("rz", "zero", joint=0), Element("tx", "length", 0.5)))
-    >>> chain_poses_and_rates(arm, np.zeros((1, 1))).position_by_parameter[0].tolist()
+    >>> chain_poses_and_derivatives(arm, np.zeros((1, 1))).position_by_parameter[0].tolist()
     [[0.0, 1.0], [0.5, 0.0], [0.0, 0.0]]
     """
     constants = chain.nominal_values if parameters is None else np.asarray(parameters, float)
@@ -302,7 +302,7 @@ def chain_from_frames(
     return SerialChain(tuple(names), tuple(elements))
 
 
-def exponential(twist: np.ndarray) -> np.ndarray:
+def twist_exponential(twist: np.ndarray) -> np.ndarray:
     """Compute the exponential of twists: the transforms of screw motions.
 
     Args:
@@ -313,7 +313,7 @@ def exponential(twist: np.ndarray) -> np.ndarray:
 
     Source: Park and Okamura 1994, Kinematic calibration and the product of exponentials formula.
 
-    >>> exponential(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2])).round(6)[:3].tolist()
+    >>> twist_exponential(np.array([0.0, 0.0, 0.1, 0.0, 0.0, np.pi / 2])).round(6)[:3].tolist()
     [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1]]
     """
     twist = np.asarray(twist)
@@ -352,7 +352,7 @@ def product_of_exponentials(twists: np.ndarray, home: np.ndarray, joints: np.nda
     joints = np.atleast_2d(joints)
     pose = np.broadcast_to(np.eye(4), (len(joints), 4, 4))
     for k, twist in enumerate(np.asarray(twists)):
-        pose = pose @ exponential(joints[:, k, None] * twist)
+        pose = pose @ twist_exponential(joints[:, k, None] * twist)
     return pose @ home
 
 

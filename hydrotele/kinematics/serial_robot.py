@@ -38,7 +38,7 @@ from hydrotele.kinematics.serial_chain import (
     SerialChain,
     chain_from_frames,
     chain_poses,
-    chain_poses_and_rates,
+    chain_poses_and_derivatives,
     joint_axes,
 )
 
@@ -121,7 +121,7 @@ class JointCoupling(NamedTuple):
     offset: np.ndarray
 
 
-def couple_joints(robot: SerialRobot) -> JointCoupling:
+def build_joint_coupling(robot: SerialRobot) -> JointCoupling:
     """Build the map from the independent joints of a robot to all joints, which may follow others.
 
     Raises:
@@ -147,7 +147,7 @@ def couple_joints(robot: SerialRobot) -> JointCoupling:
     return JointCoupling(matrix, offset)
 
 
-def expand_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
+def expand_mimic_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
     """Return the positions of all joints from readings, which may omit the joints that follow others.
 
     Args:
@@ -166,7 +166,7 @@ def expand_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
         return readings
     if count != len(robot.independent_joint_names):
         raise ValueError(f"{count} columns, but {robot.name} has {len(robot.joints)} joints")
-    coupling = couple_joints(robot)
+    coupling = build_joint_coupling(robot)
     return readings @ coupling.matrix.T + coupling.offset
 
 
@@ -197,7 +197,9 @@ def robot_chain(robot: SerialRobot) -> SerialChain:
     return chain_from_frames(frames, kinds, robot.joint_names, tool[:3, 3])  # type: ignore[arg-type]
 
 
-def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]) -> SerialRobot:
+def apply_calibrated_parameters(
+    robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]
+) -> SerialRobot:
     """Return a robot whose joint origins and ball position include calibrated parameters.
 
     Args:
@@ -302,7 +304,7 @@ def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequen
     return made
 
 
-def robot_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
+def compute_ball_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
     """Compute the poses of the ball from encoder readings, with the robot's joint corrections.
 
     Args:
@@ -322,8 +324,8 @@ class PositionSolution(NamedTuple):
     remaining_distance: np.ndarray
 
 
-def solve_ball_positions(
-    robot: SerialRobot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
+def solve_joints_for_ball(
+    robot: SerialRobot, ball_positions: np.ndarray, start: np.ndarray, iterations: int = 50,
     idle: int | None = None,
 ) -> PositionSolution:  # fmt: skip
     """Compute encoder readings that bring the ball to given positions, by damped least squares.
@@ -333,7 +335,7 @@ def solve_ball_positions(
 
     Args:
         robot: nominal or calibrated robot.
-        places: (n, 3) ball positions in the base frame [m].
+        ball_positions: (n, 3) ball positions in the base frame [m].
         start: (n, k) start of the joints; joints that follow others are set from these.
         iterations: maximum number of steps.
         idle: column of a joint that does not move, or None.
@@ -343,16 +345,16 @@ def solve_ball_positions(
 
     Source: Wampler 1986 (damped least squares).
     """
-    chain, coupling = robot_chain(robot), couple_joints(robot)
+    chain, coupling = robot_chain(robot), build_joint_coupling(robot)
     independent = [joint.mimic is None for joint in robot.joints]
-    joints = expand_joints(robot, np.asarray(start, float)[:, independent])
+    joints = expand_mimic_joints(robot, np.asarray(start, float)[:, independent])
     motion = coupling.matrix
     if idle is not None:
         motion = motion * (motion[idle] == 0.0)
-    gap = np.zeros_like(places)
+    gap = np.zeros_like(ball_positions)
     for _ in range(iterations + 1):
-        found = chain_poses_and_rates(chain, _apply_corrections(robot, joints))
-        gap = places - found.position
+        found = chain_poses_and_derivatives(chain, _apply_corrections(robot, joints))
+        gap = ball_positions - found.position
         size = np.sum(gap**2, axis=1)
         if size.max(initial=0.0) < 1e-24:
             break
@@ -469,7 +471,7 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRob
             raise InputError(path, f"is not a robot file: its first element is <{root.tag}>")
     names = robot.joint_names
     _check_names(path, names)
-    couple_joints(robot)
+    build_joint_coupling(robot)
     if joints is not None and joints not in (len(names), len(robot.independent_joint_names)):
         raise InputError(path, _describe_joint_count(robot, joints))
     return robot
@@ -561,7 +563,7 @@ def robot_to_yaml(robot: SerialRobot, source: str) -> str:
     return yaml.safe_dump(data, sort_keys=False, width=100)
 
 
-def correct_urdf(robot: SerialRobot, text: str) -> str:
+def write_origins_to_urdf(robot: SerialRobot, text: str) -> str:
     """Return the text of a URDF in which joint origins and ball are those of a calibrated robot.
 
     Fixed joints keep their origins; the errors in front of a moving joint are added to its origin.
@@ -576,16 +578,16 @@ def correct_urdf(robot: SerialRobot, text: str) -> str:
     """
     root = ElementTree.fromstring(text)
     found = {joint.get("name"): joint for joint in root.findall("joint")}
-    by_child = {_link_name(joint, "child"): joint for joint in found.values()}
+    by_child = {_connected_link_name(joint, "child"): joint for joint in found.values()}
     last = ""
     for joint in robot.joints:
         element = found[joint.name]
-        before, link = np.eye(4), _link_name(element, "parent")
+        before, link = np.eye(4), _connected_link_name(element, "parent")
         while link in by_child and by_child[link].get("type") not in _MOVING_JOINT_KINDS:
             before = _read_origin(robot.source, by_child[link]) @ before
-            link = _link_name(by_child[link], "parent")
+            link = _connected_link_name(by_child[link], "parent")
         _set_origin(element, np.linalg.inv(before) @ joint.origin)
-        last = _link_name(element, "child")
+        last = _connected_link_name(element, "child")
     ElementTree.SubElement(root, "link", {"name": "calibrated_ball"})
     ball = ElementTree.SubElement(root, "joint", {"name": "calibrated_ball", "type": "fixed"})
     ElementTree.SubElement(ball, "parent", {"link": last})
@@ -648,18 +650,18 @@ def _read_urdf(path: Path, root: ElementTree.Element, columns: int | None) -> Se
     _check_names(path, [str(joint.get("name")) for joint in joints])
     by_child: dict[str, ElementTree.Element] = {}
     for joint in joints:
-        first = by_child.setdefault(_link_name(joint, "child"), joint)
+        first = by_child.setdefault(_connected_link_name(joint, "child"), joint)
         if first is not joint:
             name, other = first.get("name"), joint.get("name")
-            message = f"link {_link_name(joint, 'child')!r} is the child of two joints, {name} and {other}"
+            message = f"link {_connected_link_name(joint, 'child')!r} is the child of two joints, {name} and {other}"
             raise InputError(path, f"{message}; a URDF is a tree")
-    parents = {_link_name(joint, "parent") for joint in joints}
+    parents = {_connected_link_name(joint, "parent") for joint in joints}
     ends: list[_End] = []
     for link in by_child:
         way, at = [], link
         while at in by_child and len(way) <= len(joints):
             way.insert(0, by_child[at])
-            at = _link_name(by_child[at], "parent")
+            at = _connected_link_name(by_child[at], "parent")
         if len(way) > len(joints):
             raise InputError(path, f"joints around link {link!r} form a closed loop")
         ends.append(_End(link, sum(joint.get("type") != "fixed" for joint in way), link not in parents, way))
@@ -719,7 +721,7 @@ def _read_mjcf(path: Path, columns: int | None) -> SerialRobot:
     ends = [("site", s, int(model.site_bodyid[s])) for s in range(model.nsite)]
     ends += [("body", b, b) for b in range(1, model.nbody)]
 
-    def chain(body: int) -> list[int]:
+    def list_joints_to_body(body: int) -> list[int]:
         joints: list[int] = []
         while body:
             first, many = int(model.body_jntadr[body]), int(model.body_jntnum[body])
@@ -729,9 +731,14 @@ def _read_mjcf(path: Path, columns: int | None) -> SerialRobot:
 
     parents = set(model.body_parentid.tolist())
     found = [
-        _End(getattr(model, kind)(k).name or "", len(chain(body)), body not in parents, (kind, k, chain(body)))
+        _End(
+            getattr(model, kind)(k).name or "",
+            len(list_joints_to_body(body)),
+            body not in parents,
+            (kind, k, list_joints_to_body(body)),
+        )
         for kind, k, body in ends
-        if all(int(model.jnt_type[j]) in kinds for j in chain(body))
+        if all(int(model.jnt_type[j]) in kinds for j in list_joints_to_body(body))
     ]
     kind, k, joints = _choose_end(path, found, columns).way
     mimics = _read_joint_equalities(path, model, joints)
@@ -774,7 +781,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
     """
     import mujoco
 
-    def moved_by(body: int) -> set[int]:
+    def list_joints_moving_body(body: int) -> set[int]:
         return {j for j in range(model.njnt) if _is_ancestor(model, int(model.jnt_bodyid[j]), body)}
 
     def constrained_joints(e: int) -> set[int]:
@@ -788,7 +795,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
             return set()
         if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
             first, second = int(model.site_bodyid[first]), int(model.site_bodyid[second])
-        return moved_by(first) ^ moved_by(second)
+        return list_joints_moving_body(first) ^ list_joints_moving_body(second)
 
     mimics: dict[int, Mimic] = {}
     for e in range(model.neq):
@@ -813,7 +820,7 @@ def _is_ancestor(model: Any, ancestor: int, body: int) -> bool:
     return body == ancestor
 
 
-def _link_name(joint: ElementTree.Element, end: str) -> str:
+def _connected_link_name(joint: ElementTree.Element, end: str) -> str:
     element = joint.find(end)
     return "" if element is None else str(element.get("link"))
 

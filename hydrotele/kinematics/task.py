@@ -57,11 +57,11 @@ def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
 
 
 @compiled
-def task_forward(g, q, pose):
+def compute_tip_pose(arm, q, pose):
     """Compute the pose of an arm's tip from its joint angles (forward kinematics).
 
     Args:
-        g: (9,) output of `arm_parameters`.
+        arm: (9,) output of `arm_parameters`.
         q: (k,) swing, boom, stick and, if driven, tool and head angle [rad]; k is 3, 4 or 5.
         pose: (5,) written: r [m], theta [rad], z [m], attitude [rad], head [rad]; the head angle is
             0 for an arm without a head, the attitude is that of the last link.
@@ -74,12 +74,12 @@ def task_forward(g, q, pose):
     k = len(q)
     head = q[4] if k > 4 else 0.0
     tool = q[3] if k > 3 else 0.0
-    elbow = q[1] + q[2] + g[5]
+    elbow = q[1] + q[2] + arm[5]
     attitude = q[1] + q[2] + tool
-    along, side = g[6] + g[8] * math.cos(head), g[2] - g[8] * math.sin(head)
+    along, side = arm[6] + arm[8] * math.cos(head), arm[2] - arm[8] * math.sin(head)
     c, s = math.cos(attitude), math.sin(attitude)
-    x = g[0] + g[3] * math.cos(q[1]) + g[4] * math.cos(elbow) + along * c - g[7] * s
-    z = g[1] + g[3] * math.sin(q[1]) + g[4] * math.sin(elbow) + along * s + g[7] * c
+    x = arm[0] + arm[3] * math.cos(q[1]) + arm[4] * math.cos(elbow) + along * c - arm[7] * s
+    z = arm[1] + arm[3] * math.sin(q[1]) + arm[4] * math.sin(elbow) + along * s + arm[7] * c
     pose[0] = math.sqrt(x * x + side * side)
     pose[1] = q[0] + math.atan2(side, x)
     pose[2] = z
@@ -88,12 +88,12 @@ def task_forward(g, q, pose):
 
 
 @compiled
-def task_inverse(g, pose, present_swing, q):
+def solve_joint_angles(g, pose, present_swing, q):
     """Compute the joint angles for a pose of the tip, with the elbow above and the tip ahead.
 
     Args:
         g: (9,) output of `arm_parameters`.
-        pose: (5,) pose as written by `task_forward`.
+        pose: (5,) pose as written by `compute_tip_pose`.
         present_swing: present swing angle, scalar [rad]; the result is within half a turn of it.
         q: (k,) joint angles [rad], written unless the pose is out of reach.
 
@@ -130,7 +130,7 @@ def task_inverse(g, pose, present_swing, q):
 
 
 @compiled
-def task_rates(g, q, pose, rate, out):
+def compute_joint_rates(g, q, pose, rate, out):
     """Compute the joint rates that give a rate of the tip's pose.
 
     Args:
@@ -143,7 +143,7 @@ def task_rates(g, q, pose, rate, out):
     Returns:
         REACHED (0), or SINGULAR (2): a straight elbow, or a tip on the swing axis.
 
-    Source: closed-form solution of the derivative of `task_forward`.
+    Source: closed-form solution of the derivative of `compute_tip_pose`.
     """
     k = len(q)
     head, turning = (q[4], rate[4]) if k > 4 else (0.0, 0.0)
@@ -184,7 +184,7 @@ def task_jacobian(g, q, out):
     Returns:
         Nothing.
 
-    Source: derivative of `task_forward`.
+    Source: derivative of `compute_tip_pose`.
     """
     k = len(q)
     head = q[4] if k > 4 else 0.0

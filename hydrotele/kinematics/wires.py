@@ -124,11 +124,11 @@ def pose_from_wires(wires: WireGeometry, lengths: np.ndarray, near: PlatformPose
     sides = np.broadcast_to([side[0, 2], side[1, 2]], (*shape, 2))
     radii = np.concatenate([lengths[..., 5:], sides], axis=-1)
     third = trilaterate(centres, radii, expected[..., 2, :])
-    rotation = _triad(first, second, third) @ np.swapaxes(_triad(*points), -1, -2)
+    rotation = _axes_from_points(first, second, third) @ np.swapaxes(_axes_from_points(*points), -1, -2)
     return PlatformPose(rotation, first - np.einsum("...ij,j->...i", rotation, points[0]))
 
 
-def _triad(first, second, third) -> np.ndarray:
+def _axes_from_points(first, second, third) -> np.ndarray:
     """Build the axes (..., 3, 3) of a frame from three points: x from first to second, z normal to the plane."""
     x = second - first
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)

@@ -20,7 +20,7 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.rows import RunRows
-from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_converter, channel_sensor
+from hydrotele.machine.machine import Machine, Sensor, SensorSet, find_channel_sensor, make_channel_converter
 
 _ANGLE_TOLERANCE = 0.35  # [rad] tolerance beyond a joint's range; sensor zeros are often inaccurate
 _LENGTH_TOLERANCE = 0.2  # tolerance as a fraction of the stroke or range, for the same reason
@@ -105,7 +105,7 @@ def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: fl
     Returns:
         (n,) whether a reading is saturated or close to it.
     """
-    step, low, high = channel_converter(sensor, channel)
+    step, low, high = make_channel_converter(sensor, channel)
     at_end = np.zeros(len(reading), dtype=bool)
     if not math.isfinite(high):
         return at_end
@@ -193,7 +193,7 @@ def readings_per_update(reading: np.ndarray) -> float:
     return float(lasted[once & regular].mean())
 
 
-def find_repeated(reading: np.ndarray, per_update: float) -> np.ndarray:
+def find_readings_without_update(reading: np.ndarray, per_update: float) -> np.ndarray:
     """Find readings that repeat the previous one only because the channel was not updated.
 
     If a value lasts longer than one update period, the readings at which an update is due count as new.
@@ -205,7 +205,7 @@ def find_repeated(reading: np.ndarray, per_update: float) -> np.ndarray:
     Returns:
         (n,) whether a reading is such a repetition.
 
-    >>> find_repeated(np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]), 2.0).tolist()
+    >>> find_readings_without_update(np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]), 2.0).tolist()
     [False, True, False, True, False, True]
     """
     rows = np.flatnonzero(np.isfinite(reading))
@@ -238,19 +238,19 @@ class Interval(NamedTuple):
     last: int
 
 
-def repeat_probability(sensor: Sensor, channel: str) -> float | None:
+def equal_reading_probability(sensor: Sensor, channel: str) -> float | None:
     """Return the largest probability that a noisy sensor gives the same reading twice [1].
 
     The result is None if the noise is unknown or less than the converter step, so that equal readings
     of a constant value are normal.
 
-    >>> repeat_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
+    >>> equal_reading_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
     0.0625
     """
     if sensor.error_rms == 0.0:
         return None
     width = 2.0 * sensor.accuracy or math.sqrt(2.0 * math.pi) * sensor.standard_deviation
-    share = channel_converter(sensor, channel).step / width
+    share = make_channel_converter(sensor, channel).step / width
     return max(share, 1.0e-9) if share <= 0.5 else None
 
 
@@ -268,10 +268,10 @@ def min_suspicious_repeat(probability: float, count: int) -> int:
     return 1 + math.ceil(math.log(_FALSE_ALARM_PROBABILITY / max(count, 1)) / math.log(probability))
 
 
-def find_repeats(reading: np.ndarray, min_length: int) -> list[Interval]:
+def find_constant_intervals(reading: np.ndarray, min_length: int) -> list[Interval]:
     """Find intervals of at least `min_length` equal readings; missing readings count as equal.
 
-    >>> find_repeats(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
+    >>> find_constant_intervals(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
     [Interval(first=1, last=5)]
     """
     rows = np.flatnonzero(np.isfinite(reading))
@@ -284,14 +284,14 @@ def find_repeats(reading: np.ndarray, min_length: int) -> list[Interval]:
     ]
 
 
-def is_saturated(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
+def are_repeats_at_extreme(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
     """Return whether a channel is saturated rather than frozen.
 
     It is if it repeats readings in several intervals, all at the same value, and this value is the
     minimum or maximum of the run.
 
     >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
-    >>> is_saturated(reading, find_repeats(reading, 2))
+    >>> are_repeats_at_extreme(reading, find_constant_intervals(reading, 2))
     True
 
     Args:
@@ -318,17 +318,17 @@ def estimate_noise(reading: np.ndarray) -> float:
         math.nan)  # fmt: skip
 
 
-def has_stated_noise(sensor: Sensor, channel: str, floors: Sequence[float]) -> bool:
+def is_noise_as_stated(sensor: Sensor, channel: str, noise_estimates: Sequence[float]) -> bool:
     """Return whether the measured noise of a sensor is at least half of the stated noise.
 
     Args:
         sensor: the sensor, with its stated noise.
         channel: channel name.
-        floors: noise estimates of this channel and of others with an equal sensor, in order of
+        noise_estimates: noise estimates of this channel and of others with an equal sensor, in order of
             preference; the first finite one is used [channel's unit].
     """
-    stated = math.hypot(sensor.error_rms, channel_converter(sensor, channel).step / 12**0.5)
-    known = [floor for floor in floors if math.isfinite(floor)]
+    stated = math.hypot(sensor.error_rms, make_channel_converter(sensor, channel).step / 12**0.5)
+    known = [floor for floor in noise_estimates if math.isfinite(floor)]
     return bool(known) and known[0] >= _MIN_NOISE_RATIO * stated
 
 
@@ -342,7 +342,7 @@ def find_frozen_by_noise(reading: np.ndarray, probability: float, count: int, pe
         period: time between rows [s].
     """
     shortest = max(min_suspicious_repeat(probability, count), math.ceil(_MIN_FREEZE_SECONDS / period))
-    return find_repeats(reading, shortest)
+    return find_constant_intervals(reading, shortest)
 
 
 def find_frozen_position(
@@ -369,7 +369,7 @@ def find_frozen_position(
     least = own * 0.02
     low, high = np.nanmin(reading), np.nanmax(reading)
     found = []
-    for part in find_repeats(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period)):
+    for part in find_constant_intervals(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period)):
         rows = slice(*part)
         if partner is not None and partners > 0.0:
             moved = _robust_range(partner[rows]) / partners
@@ -399,7 +399,7 @@ def find_frozen_pressure(reading: np.ndarray, partner: np.ndarray, lowest: float
     """
     return [
         part
-        for part in find_repeats(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period))
+        for part in find_constant_intervals(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period))
         if _robust_range(partner[slice(*part)]) > _MIN_PARTNER_PRESSURE_CHANGE
         and np.nanmedian(reading[slice(*part)]) > lowest
     ]
@@ -484,7 +484,7 @@ class _CleaningData(NamedTuple):
 
     def sensor(self, channel: str) -> Sensor:
         """Return the properties of a channel's sensor: noise, resolution and span."""
-        return channel_sensor(self.machine, self.sensors, channel)
+        return find_channel_sensor(self.machine, self.sensors, channel)
 
 
 class CleanedRuns(NamedTuple):
@@ -590,7 +590,7 @@ def _remove_repeated_readings(data: _CleaningData, run: str, channel: str) -> li
     if every == 1.0:
         return []
     step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
-    repeated = find_repeated(reading, every)
+    repeated = find_readings_without_update(reading, every)
     data.count_removed(channel, run, "repetitions of a slow channel", int(repeated.sum()))
     reading[repeated] = np.nan
     lasts = 1e3 * every * step
@@ -609,8 +609,8 @@ def _find_frozen_intervals(data: _CleaningData, run: str, channel: str) -> list[
     """
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
-    probability = repeat_probability(sensor, channel)
-    if probability and has_stated_noise(sensor, channel, _noise_estimates(data, run, channel)):
+    probability = equal_reading_probability(sensor, channel)
+    if probability and is_noise_as_stated(sensor, channel, _first_noise_estimate(data, run, channel)):
         return find_frozen_by_noise(reading, probability, _count_readings(data), period)
     kind, _, axis = channel.partition(".")
     if kind == "pressure_supply":  # may be constant at the relief pressure for any time
@@ -640,12 +640,12 @@ def _find_frozen_positions(data: _CleaningData, run: str, channel: str, axis: st
     return find_frozen_position(
         reading, data.column(partner, run), command / (force.command_limit if force else 1.0),
         np.column_stack(apart) if apart else np.empty((len(command), 0)),
-        channel_converter(data.sensor(channel), channel).step or _DEFAULT_RESOLUTION * span,
+        make_channel_converter(data.sensor(channel), channel).step or _DEFAULT_RESOLUTION * span,
         (span, data.span(partner)), data.runs[run].period,
     )  # fmt: skip
 
 
-def _noise_estimates(data: _CleaningData, run: str, channel: str) -> list[float]:
+def _first_noise_estimate(data: _CleaningData, run: str, channel: str) -> list[float]:
     """Return a list of one noise estimate of a channel, NaN if there is none.
 
     The first finite estimate is taken: of this run, of other runs, of channels with an equal sensor.
@@ -673,7 +673,7 @@ def _remove_frozen_readings(data: _CleaningData, run: str, channel: str, parts) 
     value = np.nanmedian(reading[slice(*parts[0])])
     said = f"{run}: {channel} is frozen at {value:.6g} {listed}; these readings were removed."
     before, reason = np.isfinite(reading).sum(), "frozen"
-    if is_saturated(reading, parts):
+    if are_repeats_at_extreme(reading, parts):
         noise = float(data.noise[list(data.channels).index(channel)])
         near = np.abs(reading - value) <= _LIMIT_NOISE_RATIO * (noise if math.isfinite(noise) else 0.0)
         reading[near] = np.nan
@@ -687,8 +687,8 @@ def _remove_frozen_readings(data: _CleaningData, run: str, channel: str, parts) 
 
 def _remove_duplicated_rows(data: _CleaningData, run: str) -> list[str]:
     rows = data.runs[run]
-    odds = [repeat_probability(data.sensor(c), c) for c in data.channels]
-    odds = [p if p and has_stated_noise(data.sensor(c), c, _noise_estimates(data, run, c))
+    odds = [equal_reading_probability(data.sensor(c), c) for c in data.channels]
+    odds = [p if p and is_noise_as_stated(data.sensor(c), c, _first_noise_estimate(data, run, c))
             else None for c, p in zip(data.channels, odds, strict=True)]  # fmt: skip
     again = find_duplicated_rows(rows.reading, odds, _count_readings(data))
     if not again.any():

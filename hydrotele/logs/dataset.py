@@ -33,9 +33,9 @@ from hydrotele.machine.machine import (
     IDEAL_SENSORS,
     Machine,
     SensorSet,
-    channel_sensor,
-    get_sensors,
-    noise_rms,
+    find_channel_sensor,
+    get_sensor_set,
+    reading_noise_rms,
 )
 from hydrotele.machine.signals import parse_channel
 
@@ -63,7 +63,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
     )
 
 
-def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
+def logged_predicted_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
     """Return the channels that the model of a machine predicts and at least one run contains.
 
     Raises:
@@ -98,7 +98,7 @@ def determine_sensors(
         InputError: the machine has no such sensors, or the logs have different ones.
     """
     if name is not None:
-        return get_sensors(machine, name), []
+        return get_sensor_set(machine, name), []
     stated = {log.metadata["sensors"]: log.source
               for run in files for log in run.logs if "sensors" in log.metadata}  # fmt: skip
     if len(stated) > 1:
@@ -122,9 +122,9 @@ def determine_sensors(
 
 def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
     """Return the noise standard deviation of one reading [channel's unit], NaN if unknown."""
-    if channel_sensor(machine, sensors, channel).error_rms == 0.0:
+    if find_channel_sensor(machine, sensors, channel).error_rms == 0.0:
         return math.nan
-    return noise_rms(machine, sensors, channel)
+    return reading_noise_rms(machine, sensors, channel)
 
 
 def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
@@ -262,7 +262,7 @@ def split_runs(
     marked = [name for name in names if name.lower().startswith(_HELD_OUT_PREFIXES)]
     if marked == names:
         marked = []
-    chosen = heldout or (marked or [_last_piece(runs) if len(names) == 1 else names[-1]])[0]
+    chosen = heldout or (marked or [_choose_heldout_piece(runs) if len(names) == 1 else names[-1]])[0]
     pieces = [n for n in runs if chosen in (n, origin[n])]
     judge = max(pieces, key=lambda n: run_duration(runs[n]))
     aside = set(marked if heldout is None else ()) | {chosen}
@@ -279,7 +279,7 @@ def split_runs(
     return Split(parts, RunPart(judge, judge, runs[judge])), notes
 
 
-def _last_piece(runs: Mapping[str, RunRows]) -> str:
+def _choose_heldout_piece(runs: Mapping[str, RunRows]) -> str:
     """Return the name of the piece of a run to hold out for validation.
 
     It is the last piece with 15 to 60 % of the total duration; without one, the last piece.
@@ -300,7 +300,7 @@ def _split_in_time(name: str, rows: RunRows) -> Split:
             f"is the only run and {total:.3g} s long; holding out its last quarter needs at least"
             f" {least:.3g} s: record a longer run or a second run",
         )
-    last = _fit_rows(rows)
+    last = _count_fit_rows(rows)
     count = int(np.clip(last * rows.period // _MIN_PIECE_SECONDS, 1, _MAX_PIECES))
     edges = np.linspace(0, last, count + 1).astype(int)
     fit = tuple(
@@ -310,7 +310,7 @@ def _split_in_time(name: str, rows: RunRows) -> Split:
     return Split(fit, RunPart(f"{name}_heldout", name, slice_rows(rows, edges[-1], n)))
 
 
-def _fit_rows(rows: RunRows) -> int:
+def _count_fit_rows(rows: RunRows) -> int:
     """Return the number of first rows of a single run to fit; the others are held out.
 
     They are three quarters of the rows. A machine at rest cannot validate a model: if less than 10 % of
@@ -386,7 +386,7 @@ def make_complete_logs(files: Sequence[RunFiles], merged: "MergedRuns", machine:
         merged: the result of `merge_runs` for them.
         machine: the machine.
     """
-    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
     by_name, logs = {run.name: run for run in files}, []
     first = [channels.index(c) for axis in axes if (c := f"{machine.position_kind(axis)}.{axis}") in channels]
     for name, rows in merged.pieces.items():
@@ -535,7 +535,7 @@ def make_dataset(
     files = [remove_truth(run) for run in files]
     for run in files:
         check_commands(run, machine)
-    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
     check_mask_runs(masks, [run.name for run in files])
     known, notes = determine_sensors(files, machine, sensors)
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
@@ -609,7 +609,7 @@ def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[Mask
         InputError: no channel is of the machine, the time stamps follow no clock, too many rows are
             missing, or values are outside the range of the machine.
     """
-    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
     pieces, origin, notes = {}, {}, []
     for run in files:
         parts, said = merge_run(run, axes, channels, masks)

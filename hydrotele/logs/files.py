@@ -69,10 +69,10 @@ def read_runs(
             if other == name:
                 message = f"run {name!r} exists twice, also as {others[0].source}: rename one"
                 raise InputError(found[0].source, message)
-    return tuple(RunFiles(name, align_origins(found)) for name, found in sorted(runs, key=lambda run: run[0]))
+    return tuple(RunFiles(name, align_time_origins(found)) for name, found in sorted(runs, key=lambda run: run[0]))
 
 
-def align_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
+def align_time_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
     """Return the logs of one run with times counted from the same instant.
 
     Times of a log are counted from its `origin`, if its stamps are calendar time. If some logs of the run

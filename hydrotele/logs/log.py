@@ -17,11 +17,17 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file
-from hydrotele.core.units import canonical_unit, to_si
-from hydrotele.logs.stamps import repair_time
+from hydrotele.core.units import canonical_unit, si_unit_and_factor
+from hydrotele.logs.stamps import repair_time_stamps
 from hydrotele.logs.table import DATE_UNIT, Table, parse_label, read_table
 from hydrotele.machine import signals
-from hydrotele.machine.signals import allowed_units, close_matches, default_unit, magnitude_limits, parse_channel
+from hydrotele.machine.signals import (
+    allowed_channel_units,
+    default_channel_unit,
+    parse_channel,
+    plausible_magnitude_limits,
+    suggest_channel_names,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -40,7 +46,7 @@ class CommandRange(NamedTuple):
     high: float
 
 
-def mask_to_valid(table: Table) -> Table:
+def convert_mask_column(table: Table) -> Table:
     """Replace the column `mask` (1 for unusable rows) by the column `valid` (1 for usable rows)."""
     values = [1.0 - column if name == "mask" else column
               for name, column in zip(table.names, table.values, strict=True)]  # fmt: skip
@@ -68,7 +74,7 @@ def normalise_commands(table: Table, ranges: Mapping[str, CommandRange]) -> Tabl
         known, column, axis = ranges[name], values[place], name.partition(".")[2]
         own, stated = canonical_unit(known.unit), canonical_unit(units[place] or known.unit)
         if stated != own:
-            (si, factor), (own_si, own_factor) = to_si(stated), to_si(own)
+            (si, factor), (own_si, own_factor) = si_unit_and_factor(stated), si_unit_and_factor(own)
             if si == "1" != own_si:
                 continue
             if si != own_si:
@@ -92,7 +98,7 @@ def normalise_commands(table: Table, ranges: Mapping[str, CommandRange]) -> Tabl
     return table._replace(values=values, units=units)
 
 
-def check_table(table: Table, required: Sequence[str]) -> Table:
+def check_and_convert_table(table: Table, required: Sequence[str]) -> Table:
     """Check column names, units and magnitudes of a table, and return it in SI units.
 
     Columns without a unit get the usual one of their channel. NaN is accepted except in the time.
@@ -112,7 +118,7 @@ def check_table(table: Table, required: Sequence[str]) -> Table:
     return si
 
 
-def check_complete(table: Table) -> None:
+def check_finite_and_ordered(table: Table) -> None:
     """Check that all values are finite and that time increases.
 
     Raises:
@@ -153,7 +159,9 @@ def missing_channels_message(names: Sequence[str], present: Sequence[str] | Mapp
         present: the channels of the log.
     """
     columns = "columns" if len(names) > 1 else "column"
-    hints = [f"{other!r} may be {name}" for name in names for other in present if name in close_matches(other)[:1]]
+    hints = [
+        f"{other!r} may be {name}" for name in names for other in present if name in suggest_channel_names(other)[:1]
+    ]
     hint = f" ({'; '.join(hints)}: rename it, or give it an alias in log_columns)" if hints else ""
     return f"needs the {columns} {', '.join(names)}; it has {', '.join(present) or 'none'}{hint}"
 
@@ -167,12 +175,12 @@ def _to_si_units(table: Table) -> Table:
     columns, units, present = [], [], set(table.names)
     for name, values, stated in zip(table.names, table.values, table.units, strict=True):
         if stated is None or (stated == DATE_UNIT and name == "time"):
-            unit, factor = default_unit(name, present), 1.0
+            unit, factor = default_channel_unit(name, present), 1.0
         elif stated == DATE_UNIT:
             raise InputError(table.location(name), "contains dates, not numbers: only time may be a date")
         else:
-            unit, factor = to_si(stated)
-        allowed = allowed_units(name)
+            unit, factor = si_unit_and_factor(stated)
+        allowed = allowed_channel_units(name)
         if unit not in allowed:
             raise InputError(
                 table.location(name),
@@ -225,7 +233,7 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
             row = int(bad[~np.isnan(values[bad])][0])
             remedy = "write 1 for usable rows and 0 for others"
             raise InputError(table.location(name, row), f"is {values[row]:g}: {remedy}")
-    limits = magnitude_limits(name, unit, stated=stated)
+    limits = plausible_magnitude_limits(name, unit, stated=stated)
     target = unit if stated else f"{unit} and state the unit"
     if unit == "1":
         axis = name.partition(".")[2]
@@ -282,7 +290,7 @@ class Log:
         if self.time.ndim != 1 or self.columns.keys() != self.units.keys():
             raise ValueError("time must be (n,), and columns and units must have the same keys")
         for name, values in self.columns.items():
-            allowed = signals.allowed_units(name)
+            allowed = signals.allowed_channel_units(name)
             if name == "time" or values.shape != self.time.shape or self.units[name] not in allowed:
                 expected = f"{self.time.shape} in {' or '.join(allowed)}"
                 raise ValueError(f"{name}: expected {expected}, got {values.shape} in {self.units[name]!r}")
@@ -395,7 +403,7 @@ def load_log(
         path = found
     table = read_table(path, missing=True)
     if "hydrotele" not in table.metadata:
-        table = mask_to_valid(_apply_aliases(table, aliases or {}))
+        table = convert_mask_column(_apply_aliases(table, aliases or {}))
         table = normalise_commands(table, commands or {})
     for name in table.names:
         if name in table.faults:
@@ -403,10 +411,10 @@ def load_log(
     rows, needed = len(table.values[0]) if table.names else 0, max(minimum_rows, 2)
     if rows < needed:
         raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
-    table = check_table(table, required)
+    table = check_and_convert_table(table, required)
     if complete:
-        check_complete(table)
-    table, origin, notes = repair_time(table, needed)
+        check_finite_and_ordered(table)
+    table, origin, notes = repair_time_stamps(table, needed)
     columns = dict(zip(table.names, table.values, strict=True))
     units = dict(zip(table.names, map(str, table.units), strict=True))
     time = columns.pop("time")
@@ -503,7 +511,7 @@ def save_log(log: Log, path: str | os.PathLike) -> None:
     path = Path(path)
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]
     table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
-    check_complete(table)
+    check_finite_and_ordered(table)
     content = _parquet_bytes(log.to_arrow())
     with atomic_file(path, ".parquet") as part, open(part, "xb") as file:
         file.write(content)

@@ -189,7 +189,7 @@ def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other
         The offset [s], None if it is not identifiable: constant commands or different signals.
     """
     step = min(clock.period, other.period)
-    a, b = _hold_values(clock, command, step), _hold_values(other, other_command, step)
+    a, b = _resample_zero_order_hold(clock, command, step), _resample_zero_order_hold(other, other_command, step)
     least = round(_MIN_OVERLAP_SECONDS / step)
     if min(len(a), len(b)) < least or not np.ptp(a, axis=0).any():
         return None
@@ -205,7 +205,7 @@ def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other
     return exact if exact is not None else _refine_offset(clock, command, other, other_command, coarse)
 
 
-def _hold_values(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
+def _resample_zero_order_hold(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
     """Resample values (n, k) at the rows of a clock to a uniform step [s] by zero-order hold.
 
     Between two rows the result repeats the earlier one.
@@ -261,7 +261,7 @@ def _refine_offset(clock: Clock, command, other: Clock, other_command, coarse: f
     own = clock.start + clock.tick * clock.period
     time = other.start + other.tick * other.period
 
-    def difference(offset: float) -> float:
+    def mean_square_difference(offset: float) -> float:
         inside = (own >= time[0] + offset) & (own <= time[-1] + offset)
         return sum(
             float(np.mean((np.interp(own[inside], time + offset, theirs) - mine[inside]) ** 2))
@@ -271,7 +271,7 @@ def _refine_offset(clock: Clock, command, other: Clock, other_command, coarse: f
     width = 2.0 * max(clock.period, other.period)
     from scipy.optimize import minimize_scalar
 
-    found = minimize_scalar(difference, bounds=(coarse - width, coarse + width), method="bounded",
+    found = minimize_scalar(mean_square_difference, bounds=(coarse - width, coarse + width), method="bounded",
                             options={"xatol": 1e-3 * clock.period})  # fmt: skip
     return float(found.x)  # type: ignore[union-attr]
 
@@ -410,7 +410,7 @@ def merge_run(
     notes = [note for _, several in found for note in several]
     clocks = [found[0][0]]
     for log, (clock, _) in zip(logs[1:], found[1:], strict=True):
-        offset, note = _align_clock(run, logs[0], clocks[0], log, clock, commands)
+        offset, note = _determine_clock_offset(run, logs[0], clocks[0], log, clock, commands)
         clocks.append(clock._replace(start=clock.start + offset))
         notes += note
     period, fine, off = _common_period(clocks)
@@ -431,7 +431,8 @@ def merge_run(
         notes.append(f"{run.name}: the time stamps have pauses of {seconds}; the run was split there.")
     fine *= clocks[0].hold
     rows = tuple(
-        _fill_ticks(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p]) for p in pieces
+        _make_uniform_rows(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p])
+        for p in pieces
     )
     notes += _note_nan_cells(run, logs, channels)
     if missing := sum(int((~r.known).sum()) for r in rows):
@@ -504,7 +505,7 @@ def _log_label(run: RunFiles, log: Log) -> str:
     return run.name if len(run.logs) == 1 else log.name
 
 
-def _align_clock(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
+def _determine_clock_offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
     """Return the offset to add to the times of an additional file of a run [s], and notes.
 
     Args:
@@ -596,7 +597,7 @@ def _place_on_ticks(logs, clocks, ticks, every, names) -> np.ndarray:
     return values
 
 
-def _fill_ticks(start, period, fine, tick, command, commanded, reading) -> RunRows:
+def _make_uniform_rows(start, period, fine, tick, command, commanded, reading) -> RunRows:
     """Return rows at every tick of a uniform clock from rows at some ticks.
 
     Args:

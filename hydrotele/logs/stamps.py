@@ -20,7 +20,7 @@ _MAX_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
 _MAX_DISCARDED_FRACTION = 0.5  # of the readings: more rows per stamp mean that the stamps are too coarse
 
 
-def repair_time(table: Table, minimum_rows: int) -> tuple[Table, float, tuple[str, ...]]:
+def repair_time_stamps(table: Table, minimum_rows: int) -> tuple[Table, float, tuple[str, ...]]:
     """Return a table with increasing time stamps.
 
     Rows out of order are sorted, unless a clock that was set back is the more likely cause. Rows with
@@ -40,19 +40,19 @@ def repair_time(table: Table, minimum_rows: int) -> tuple[Table, float, tuple[st
             too often.
     """
     table, notes = _sort_rows(table)
-    table, note = _merge_repeats(table)
+    table, note = _merge_equal_stamps(table)
     notes += note
     _check_step(table)
-    table, note = _cut_at_set_clock(table, minimum_rows)
+    table, note = _insert_pause_at_clock_jumps(table, minimum_rows)
     notes += note
-    time = _time(table)
+    time = _time_column(table)
     if abs(origin := float(time[0])) <= _MAX_START_SECONDS:
         return table, 0.0, notes
     notes += (f"{table.source}: the time stamps begin at {origin:.10g} s; time is counted from there.",)
     return _replace_time(table, time - origin), origin, notes
 
 
-def _time(table: Table) -> np.ndarray:
+def _time_column(table: Table) -> np.ndarray:
     return table.values[list(table.names).index("time")]
 
 
@@ -72,7 +72,7 @@ def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
     It is not sorted if the sorted rows would be irregular. The clock was then set back, and sorting would
     mix rows of different moments.
     """
-    time = _time(table)
+    time = _time_column(table)
     step = np.diff(time)
     if not (step < 0.0).any():
         return table, ()
@@ -88,12 +88,12 @@ def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
     return _select_rows(table, order), (note,)
 
 
-def _merge_repeats(table: Table) -> tuple[Table, tuple[str, ...]]:
+def _merge_equal_stamps(table: Table) -> tuple[Table, tuple[str, ...]]:
     """Return the table with one row for consecutive rows of the same time stamp, and notes.
 
     The row has the last number of each column; its `valid` is 0 if that of any merged row is.
     """
-    time = _time(table)
+    time = _time_column(table)
     repeats = np.diff(time) == 0.0
     if not repeats.any():
         return table, ()
@@ -127,20 +127,20 @@ def _merge_repeats(table: Table) -> tuple[Table, tuple[str, ...]]:
 
 def _check_step(table: Table) -> None:
     """Check that the median time step is below 1 s; otherwise the stamps are probably not in seconds."""
-    step = np.diff(_time(table))
+    step = np.diff(_time_column(table))
     period = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
     if period >= _MAX_STEP:
         remedy = "looks like milliseconds or less, write seconds, or state the unit, as in 'time [ms]'"
         raise InputError(table.location("time", 1), f"increases by {period:g} per row: {remedy}")
 
 
-def _cut_at_set_clock(table: Table, minimum_rows: int) -> tuple[Table, tuple[str, ...]]:
+def _insert_pause_at_clock_jumps(table: Table, minimum_rows: int) -> tuple[Table, tuple[str, ...]]:
     """Shift the rows after each jump of the clock in time, so that a pause of at least 2 s precedes them.
 
     Returns:
         (table, notes).
     """
-    time = _time(table)
+    time = _time_column(table)
     step = np.diff(time)
     set_clock = (step < 0.0) | (step > _MAX_START_SECONDS)
     if not set_clock.any():

@@ -75,7 +75,7 @@ def parse_label(text: str) -> tuple[str, str | None]:
     return (match["name"], (match["unit"] or "").strip() or None) if match else (text, None)
 
 
-def check_file(path: Path) -> None:
+def check_log_file(path: Path) -> None:
     """Check that a path is an existing file that ends in `.parquet` or `.csv`.
 
     Raises:
@@ -100,7 +100,7 @@ def read_table(path: Path, missing: bool = False) -> Table:
     Raises:
         InputError: the file cannot be read.
     """
-    check_file(path)
+    check_log_file(path)
     return read_csv(path, missing) if path.suffix.lower() == ".csv" else _read_parquet(path, missing)
 
 
@@ -110,7 +110,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         InputError: the file cannot be read.
     """
-    check_file(path)
+    check_log_file(path)
     if path.suffix.lower() == ".csv":
         read = _CsvReader(str(path), missing=True)
         for number, line in _iterate_lines(path, read.max_line):
@@ -122,9 +122,9 @@ def read_metadata(path: Path) -> dict[str, str]:
     import pyarrow.parquet as pq
 
     try:
-        return _table_metadata(pq.read_schema(path).metadata)
+        return _decode_table_metadata(pq.read_schema(path).metadata)
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise _unreadable_parquet(path, error) from error
+        raise _unreadable_parquet_error(path, error) from error
 
 
 def read_csv(path: Path, missing: bool = False) -> Table:
@@ -291,7 +291,7 @@ class _CsvReader:
         row = len(self.lines)
         self.lines.append(number)
         if len(cells) != len(self.names):
-            raise self._wrong_cell_count(row, cells)
+            raise self._wrong_cell_count_error(row, cells)
         try:
             if "_" in line:  # float() would read 1_000 as a number
                 raise ValueError
@@ -305,7 +305,7 @@ class _CsvReader:
         if len(self.values) > self.max_values:
             check_limit(self.source, "LOG_VALUES", len(self.values))
 
-    def _wrong_cell_count(self, row: int, cells: Sequence[str]) -> InputError:
+    def _wrong_cell_count_error(self, row: int, cells: Sequence[str]) -> InputError:
         column = self.names[min(len(cells), len(self.names)) - 1]
         reason = f"the row has {len(cells)} cells, the header has {len(self.names)}"
         remedy = f"the line is incomplete or a separator ({self.separator!r}) is missing or superfluous"
@@ -424,15 +424,15 @@ def _read_parquet(path: Path, missing: bool) -> Table:
                 values.append(convert(column))
                 if pa.types.is_timestamp(spec.type):
                     units[-1] = DATE_UNIT
-        metadata = _table_metadata(schema.metadata)
+        metadata = _decode_table_metadata(schema.metadata)
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
-        raise _unreadable_parquet(path, error) from error
+        raise _unreadable_parquet_error(path, error) from error
     return Table(str(path), names, values, units, metadata, None, faults)
 
 
-def _unreadable_parquet(path: Path, error: Exception) -> InputError:
+def _unreadable_parquet_error(path: Path, error: Exception) -> InputError:
     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
     return InputError(path, f"is not a readable Parquet file, copy it again ({reason})")
 
@@ -465,7 +465,7 @@ def _seconds_since_first(column) -> np.ndarray:
     return seconds
 
 
-def _table_metadata(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+def _decode_table_metadata(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
     return {k: v for k, v in _decode_metadata(metadata).items() if k != "pandas"}
 
 

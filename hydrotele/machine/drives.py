@@ -89,11 +89,11 @@ class Cylinder(StrictModel):
         return self
 
     @property
-    def areas(self) -> tuple[float, float]:
+    def effective_areas(self) -> tuple[float, float]:
         """Head-side and rod-side piston area [m^2]."""
         return self.area_head, self.area_rod
 
-    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def chamber_volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return head and rod chamber volumes [m^3] at piston displacements x [m], any shape.
 
         Beyond an end of the stroke, the volumes are those at the end.
@@ -113,11 +113,11 @@ class Motor(StrictModel):
     friction: Friction = Friction()
 
     @property
-    def areas(self) -> tuple[float, float]:
+    def effective_areas(self) -> tuple[float, float]:
         """Displacements of port A and port B [m^3/rad], the equivalent of piston areas."""
         return self.displacement, self.displacement
 
-    def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def chamber_volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the constant chamber volumes [m^3], in the shape of the motor angles x [rad]."""
         constant = np.full_like(x, self.dead_volume)
         return constant, constant
@@ -210,7 +210,7 @@ class Valve(StrictModel):
         return forward, backward
 
     @property
-    def compensator_drop(self) -> float:
+    def compensator_pressure_drop(self) -> float:
         """Pressure drop that the compensator maintains at the inlet edge [Pa], 0 without one."""
         if self.compensation == "none":
             return 0.0

@@ -116,7 +116,7 @@ class HandImpedance(StrictModel):
     @property
     def carried_mass(self) -> float:
         """Mass of the hand whose weight the handle carries [kg]: the smallest over all directions."""
-        return self.mass * min(1.0, principal_values(self.mass_shape).min_value)
+        return self.mass * min(1.0, find_principal_values(self.mass_shape).min_value)
 
     def axis_impedance(self, axis: int) -> tuple[float, float, float]:
         """Return mass, damping and stiffness of one handle axis with the other axes at rest.
@@ -141,7 +141,7 @@ class PrincipalValues(NamedTuple):
     angle: float
 
 
-def principal_values(shape: SymmetricMatrix) -> PrincipalValues:
+def find_principal_values(shape: SymmetricMatrix) -> PrincipalValues:
     """Return the principal values and the major axis of a symmetric 2 x 2 matrix.
 
     Args:
@@ -150,7 +150,7 @@ def principal_values(shape: SymmetricMatrix) -> PrincipalValues:
     Returns:
         The principal values and the angle of the major axis from x [rad].
 
-    >>> [round(v, 6) for v in principal_values((2.5, 0.5, 2.5))]
+    >>> [round(v, 6) for v in find_principal_values((2.5, 0.5, 2.5))]
     [2.0, 3.0, 0.785398]
     """
     xx, xy, yy = shape

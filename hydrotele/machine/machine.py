@@ -369,7 +369,7 @@ class Machine(StrictModel):
             most = abs(facts.force.gain) * facts.force.command_limit
         else:
             assert self.supply
-            most = self.supply.relief_pressure * facts.hydraulic_drive.areas[0]
+            most = self.supply.relief_pressure * facts.hydraulic_drive.effective_areas[0]
         turns = facts.cylinder is None and joint.type == "hinge"
         stiffness = most / (_END_STOP_ROTATION if turns else _END_STOP_TRAVEL)
         return EndStop(stiffness=stiffness, damping=_END_STOP_TIME_CONSTANT * stiffness)
@@ -394,32 +394,32 @@ class Machine(StrictModel):
     def _check(self):
         if excess := describe_excess("LINKS", len(self.links)):
             raise ValueError(f"links: {excess}")
-        _check_names(self.links)
+        _check_unique_joint_names(self.links)
         known = {"world", *self.links}
         for name, link in self.links.items():
-            _check_known(link.parent, known - {name}, f"links.{name}.parent")
-        _check_cycles(self.links)
+            _check_name_is_known(link.parent, known - {name}, f"links.{name}.parent")
+        _check_parent_cycles(self.links)
         joints = self.joints
         for name, axis in self.axes.items():
-            _check_known(axis.joint, joints, f"axes.{name}.joint")
+            _check_name_is_known(axis.joint, joints, f"axes.{name}.joint")
             if axis.cylinder:
-                _check_known(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
-                _check_known(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
+                _check_name_is_known(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
+                _check_name_is_known(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
             if axis.four_bar:
-                _check_known(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
-                _check_known(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
+                _check_name_is_known(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
+                _check_name_is_known(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
         for name, closure in self.closures.items():
             for end in (closure.a, closure.b):
-                _check_known(end.link, known, f"closures.{name}")
+                _check_name_is_known(end.link, known, f"closures.{name}")
         for joint in self.sensed_joints:
-            _check_known(joint, joints, "sensed_joints")
+            _check_name_is_known(joint, joints, "sensed_joints")
             if joints[joint].type != "hinge":
                 raise ValueError(f"sensed_joints: {joint} must be a hinge")
         if strange := [j for j in self.undriven_sensed_joints if j in self.axes]:
             message = f"{strange[0]} is also the name of an axis of another joint; rename one"
             raise ValueError(f"sensed_joints: {message}")
         for joint in self.home:
-            _check_known(joint, joints, "home")
+            _check_name_is_known(joint, joints, "home")
             low, high = joints[joint].range or (-np.inf, np.inf)
             if not low <= self.home[joint] <= high:
                 raise ValueError(f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}")
@@ -427,22 +427,22 @@ class Machine(StrictModel):
             for part in ("swing", "boom", "stick", "tool", "head"):
                 joint = getattr(self.arm, part)
                 if joint is not None:
-                    _check_known(joint, joints, f"arm.{part}")
-            _check_known(self.arm.tip.link, known, "arm.tip.link")
+                    _check_name_is_known(joint, joints, f"arm.{part}")
+            _check_name_is_known(self.arm.tip.link, known, "arm.tip.link")
         for channel, error in self.sensor_errors.items():
-            _check_known(channel, self.sensed_channels, "sensor_errors")
+            _check_name_is_known(channel, self.sensed_channels, "sensor_errors")
             if error.has_coupling_error:
                 places = [f"angle.{joint}" for joint in self.undriven_sensed_joints]
-                _check_known(channel, places, "sensor_errors (tilt, backlash)")
+                _check_name_is_known(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
             for channel in sensors.channels:
-                _check_known(channel, self.sensed_channels, f"sensors.{name}.channels")
+                _check_name_is_known(channel, self.sensed_channels, f"sensors.{name}.channels")
         for name, axis in self.axes.items():
             if axis.pump and self.joints[axis.joint].type != "slide":
                 raise ValueError(f"axes.{name}.pump: the axis must have a slide joint")
         for name in self.loads:
-            _check_known(name, [n for n, a in self.axes.items() if a.pump], "loads")
+            _check_name_is_known(name, [n for n, a in self.axes.items() if a.pump], "loads")
         if self.valve_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
@@ -450,7 +450,7 @@ class Machine(StrictModel):
         return self
 
 
-def _check_known(name: str, valid, where: str) -> None:
+def _check_name_is_known(name: str, valid, where: str) -> None:
     if name not in valid:
         raise ValueError(f"{where}: {name!r} is not known; {suggest_valid_name(name, valid)}")
 
@@ -458,7 +458,7 @@ def _check_known(name: str, valid, where: str) -> None:
 def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply | None) -> None:
     seen, limited = set(), supply is not None and supply.kind != "constant_pressure"
     for k, term in enumerate(terms):
-        _check_known(term.axis, axes, f"terms.{k}.axis")
+        _check_name_is_known(term.axis, axes, f"terms.{k}.axis")
         if term.balance.startswith("flow") and not axes[term.axis].is_hydraulic:
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
         if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
@@ -467,7 +467,7 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
                 " valve and a supply of kind constant_flow or load_sensing"
             )
         for variable, axis in term.variables_from.items():
-            _check_known(axis, axes, f"terms.{k}.variables_from.{variable}")
+            _check_name_is_known(axis, axes, f"terms.{k}.variables_from.{variable}")
             if variable not in ("position", "velocity", "command") and not axes[axis].is_hydraulic:
                 raise ValueError(f"terms.{k}.variables_from: axis {axis} has no {variable}")
         memory = term.play or term.switch
@@ -484,7 +484,7 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
         seen.add(key)
 
 
-def _check_names(links: dict[str, Link]) -> None:
+def _check_unique_joint_names(links: dict[str, Link]) -> None:
     if "world" in links:
         raise ValueError("links.world: world is the fixed frame; choose another name")
     owner: dict[str, str] = {}
@@ -493,7 +493,7 @@ def _check_names(links: dict[str, Link]) -> None:
             raise ValueError(f"links.{name}.joint: {link.joint.name!r} is already the joint of link {first!r}")
 
 
-def _check_cycles(links: dict[str, Link]) -> None:
+def _check_parent_cycles(links: dict[str, Link]) -> None:
     for start in links:
         seen, link = {start}, links[start].parent
         while link != "world":
@@ -503,19 +503,19 @@ def _check_cycles(links: dict[str, Link]) -> None:
             link = links[link].parent
 
 
-def dependent_joints(machine: Machine) -> tuple[str, ...]:
+def find_dependent_joints(machine: Machine) -> tuple[str, ...]:
     """Return the names of the undriven joints in closed kinematic loops; the loops determine their positions."""
     driven = {axis.joint for axis in machine.axes.values()}
     names: list[str] = []
     for closure in machine.closures.values():
-        for link in loop_links(machine, closure.a.link, closure.b.link):
+        for link in find_links_between(machine, closure.a.link, closure.b.link):
             joint = machine.links[link].joint
             if joint and joint.name not in driven and joint.name not in names:
                 names.append(joint.name)
     return tuple(names)
 
 
-def loop_links(machine: Machine, a: str, b: str) -> list[str]:
+def find_links_between(machine: Machine, a: str, b: str) -> list[str]:
     """Return the links on the path between two links of the kinematic tree, without their common ancestors."""
     chains = []
     for link in (a, b):
@@ -539,7 +539,7 @@ _SENSOR_KIND_OF_CHANNEL = {
 }
 
 
-def get_sensors(machine: Machine, name: str) -> SensorSet | None:
+def get_sensor_set(machine: Machine, name: str) -> SensorSet | None:
     """Return a sensor set of a machine by name; None for ideal sensors.
 
     Raises:
@@ -555,7 +555,7 @@ def get_sensors(machine: Machine, name: str) -> SensorSet | None:
     return machine.sensors[name]
 
 
-def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
+def find_channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
     """Return the sensor of a channel, an ideal one if `sensors` is None.
 
     The default span of a length sensor is the cylinder's stroke.
@@ -583,7 +583,7 @@ class Converter(NamedTuple):
     high: float
 
 
-def channel_converter(sensor: Sensor, channel: str) -> Converter:
+def make_channel_converter(sensor: Sensor, channel: str) -> Converter:
     """Return the analogue-to-digital converter of a channel; lengths and pressures are limited to 0 .. span."""
     if sensor.bits is None or sensor.span is None:
         return Converter(0.0, -math.inf, math.inf)
@@ -593,10 +593,10 @@ def channel_converter(sensor: Sensor, channel: str) -> Converter:
     return Converter(step, 0.0, sensor.span)
 
 
-def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
+def reading_noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
     """Return the standard deviation of one reading [channel's unit]: random error plus rounding."""
-    sensor = channel_sensor(machine, sensors, channel)
-    return math.sqrt(sensor.error_rms**2 + channel_converter(sensor, channel).step ** 2 / 12.0)
+    sensor = find_channel_sensor(machine, sensors, channel)
+    return math.sqrt(sensor.error_rms**2 + make_channel_converter(sensor, channel).step ** 2 / 12.0)
 
 
 @compiled

@@ -31,7 +31,7 @@ from hydrotele.terms.law import LAWS
 MACHINE_FILE = "machine.yaml"
 
 
-def machine_path(name_or_path: str | Path) -> Path:
+def find_machine_file(name_or_path: str | Path) -> Path:
     """Return the file of a shipped machine (by name) or of a user machine (folder or YAML file).
 
     A plain name always means the shipped machine; write `./name` for a folder of the same name.
@@ -73,7 +73,7 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     Raises:
         InputError: the file is invalid; the message gives file, line, key and valid values.
     """
-    path = machine_path(name_or_path)
+    path = find_machine_file(name_or_path)
     data, lines = read_yaml(path)
     others: list[dict] = []
     if "extends" in data:
@@ -89,13 +89,13 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(resolve_path(path.parent))}
     others += [fragment for name, fragment in tools.items() if name != tool and fragment]
-    kept = _body_names([data])
+    kept = _mjcf_body_names([data])
     if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
         data["folder"] = str(resolve_path(models_folder()))
     elif not data.get("resolved"):
-        data["removed_bodies"] = [name for name in _body_names(others) if name not in kept]
-    _complete_links(data, path, lines)
-    _resolve_drives(data, path, lines)
+        data["removed_bodies"] = [name for name in _mjcf_body_names(others) if name not in kept]
+    _complete_links_from_mjcf(data, path, lines)
+    _convert_drive_parameters(data, path, lines)
     return validate_data(Machine, data, str(path), lines)
 
 
@@ -109,7 +109,7 @@ def save_machine(machine: Machine, path: str | Path) -> None:
             meshes, textures and height fields in `<stem>_assets`. User files that define laws of
             terms are copied as well.
     """
-    machine = _with_law_files(machine, Path(path).parent)
+    machine = _copy_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
     tool = data.pop("tool", "none")
     for key in ("folder", "tools"):
@@ -133,7 +133,7 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
-def _with_law_files(machine: Machine, folder: Path) -> Machine:
+def _copy_law_files(machine: Machine, folder: Path) -> Machine:
     """Copy user files that define laws of terms into a folder; return the machine with the names of the copies."""
     terms, copied = [], {}
     for term in machine.terms:
@@ -161,7 +161,7 @@ def _merge_extended_machine(data: dict, path: Path, lines) -> tuple[dict, list[d
         raise InputError(where, "must be {machine: NAME or FOLDER, tool: NAME}")
     name = str(base["machine"])
     beside = path.parent / name
-    file = machine_path(beside if (beside / MACHINE_FILE).is_file() else name)
+    file = find_machine_file(beside if (beside / MACHINE_FILE).is_file() else name)
     whole, base_lines = read_yaml(file)
     if "extends" in whole:
         raise InputError(where, f"{name} itself extends a machine; extend that machine directly")
@@ -224,7 +224,7 @@ def _section_entries(data: dict, section: str) -> dict:
     return {name: facts for name, facts in entries.items() if isinstance(name, str)}
 
 
-def _body_names(fragments) -> tuple[str, ...]:
+def _mjcf_body_names(fragments) -> tuple[str, ...]:
     names = []
     for fragment in fragments:
         names += _section_entries(fragment, "links")
@@ -234,7 +234,7 @@ def _body_names(fragments) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _complete_links(data: dict, path: Path, lines) -> None:
+def _complete_links_from_mjcf(data: dict, path: Path, lines) -> None:
     """Add link data from the MJCF file; a value that both files contain is an error."""
     if data.pop("resolved", False):
         return
@@ -250,7 +250,7 @@ def _complete_links(data: dict, path: Path, lines) -> None:
         if body is None or name == "world" or not isinstance(link, dict):
             continue
         where = _format_location(path, lines, "links", name)
-        known = _read_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
+        known = _read_mjcf_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
         data["links"][name] = _merge_link(link, known, where, mjcf.name)
 
 
@@ -268,7 +268,7 @@ def _merge_link(link: dict, known: dict, where: str, mjcf: str) -> dict:
     return known | link
 
 
-def _read_body(body, degrees: bool, where: str) -> dict:
+def _read_mjcf_body(body, degrees: bool, where: str) -> dict:
     """Return parent, position, inertia and joint of an MJCF body, with default classes applied."""
     facts: dict = {"parent": body.parent.name}
     if np.any(body.pos):
@@ -293,7 +293,7 @@ def _read_body(body, degrees: bool, where: str) -> dict:
     return facts
 
 
-def _resolve_drives(data: dict, path: Path, lines) -> None:
+def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
     """Convert pins in polar coordinates to points, and motor torque per psi to displacement."""
     for name, axis in _section_entries(data, "axes").items():
         if not isinstance(axis, dict):
@@ -302,16 +302,16 @@ def _resolve_drives(data: dict, path: Path, lines) -> None:
         for part in ("base_pin", "rod_pin"):
             if isinstance(cylinder, dict) and isinstance(cylinder.get(part), dict):
                 where = _format_location(path, lines, "axes", name, "cylinder", part)
-                cylinder[part] = _resolve_pin(cylinder[part], data, where)
+                cylinder[part] = _convert_polar_pin(cylinder[part], data, where)
         if isinstance(motor, dict) and "torque_per_psi" in motor:
             motor = dict(motor)
             where = _format_location(path, lines, "axes", name, "motor", "torque_per_psi")
-            torque = _check_number(motor.pop("torque_per_psi"), where)
-            ratio = _check_number(motor.pop("gear_ratio", 1.0), where)
+            torque = _parse_finite_number(motor.pop("torque_per_psi"), where)
+            ratio = _parse_finite_number(motor.pop("gear_ratio", 1.0), where)
             axis["motor"] = motor | {"displacement": torque * ratio / PSI}
 
 
-def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
+def _convert_polar_pin(pin: dict, data: dict, where: str) -> dict:
     """Return a pin with its position computed from `distance` and `angle_deg` in the x-z plane.
 
     They start at the joint of the link `from`, or at the frame's origin. A pin without `distance` is
@@ -329,14 +329,14 @@ def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
         origin = link.get("position") or scale_numbers(link.get("position_mm"), 1.0e-3) or origin
         if not isinstance(origin, list) or len(origin) != 3:
             raise InputError(where, f"links.{child}.position must be three numbers")
-    x, y, z = (_check_number(value, f"{where}: links.position") for value in origin)
-    distance = _check_number(pin.pop("distance"), f"{where}.distance")
-    angle = math.radians(_check_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
+    x, y, z = (_parse_finite_number(value, f"{where}: links.position") for value in origin)
+    distance = _parse_finite_number(pin.pop("distance"), f"{where}.distance")
+    angle = math.radians(_parse_finite_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
     pin["position"] = [x + distance * math.cos(angle), y, z + distance * math.sin(angle)]
     return pin
 
 
-def _check_number(value, where: str) -> float:
+def _parse_finite_number(value, where: str) -> float:
     try:
         number = float("nan" if isinstance(value, (str, bool)) else value)
     except (TypeError, ValueError, OverflowError):

@@ -118,12 +118,12 @@ _NO_LIMITS = MagnitudeLimits(0.0, math.inf, "")
 _COMMAND_LIMITS = MagnitudeLimits(0.0, 1.0 + 1e-3, "percent, counts or volts")
 
 
-def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeLimits:
+def plausible_magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeLimits:
     """Return the plausible range of a channel's maximum magnitude in a run [unit], to detect a wrong unit.
 
     The range is wider if the file states the unit (`stated`).
 
-    >>> magnitude_limits("angle.boom", "rad").looks_like
+    >>> plausible_magnitude_limits("angle.boom", "rad").looks_like
     'degrees'
     """
     if unit == "1" and name.startswith("command."):
@@ -147,7 +147,7 @@ def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tup
     return tuple(channel_name(kind, axis, truth=truth) for axis in axes)
 
 
-def valid_kinds() -> tuple[str, ...]:
+def valid_channel_patterns() -> tuple[str, ...]:
     """Return the forms of all valid channel names, such as `angle.<axis>`, measured channels first."""
     endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": ""}
     measured = [kind + endings[spec.axes] for kind, spec in MEASURED_KINDS.items()]
@@ -179,10 +179,10 @@ def parse_channel(name: str) -> Channel:
     return Channel(kind, axis, truth)
 
 
-def allowed_units(name: str) -> tuple[str, ...]:
+def allowed_channel_units(name: str) -> tuple[str, ...]:
     """Return the allowed SI units of the channel `name`, the usual one first.
 
-    >>> allowed_units("reference.boom")
+    >>> allowed_channel_units("reference.boom")
     ('rad', 'm')
 
     Raises:
@@ -192,30 +192,30 @@ def allowed_units(name: str) -> tuple[str, ...]:
     return (TRUTH_KINDS if channel.truth else MEASURED_KINDS)[channel.kind].units
 
 
-def default_unit(name: str, present: Iterable[str] = ()) -> str:
+def default_channel_unit(name: str, present: Iterable[str] = ()) -> str:
     """Return the default unit of a channel for files that state none.
 
     If a kind can be rotary or linear, the linear unit is used if the log has a `position` channel
     of the same axis.
 
-    >>> default_unit("reference.slide", present=["position.slide"])
+    >>> default_channel_unit("reference.slide", present=["position.slide"])
     'm'
 
     Raises:
         ValueError: as `parse_channel`.
     """
-    units = allowed_units(name)
+    units = allowed_channel_units(name)
     position = channel_name("position", parse_channel(name).axis)
     linear = units[0].startswith("rad") and not {position, _TRUTH_PREFIX + position}.isdisjoint(present)
     return units[-1] if linear else units[0]
 
 
-def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
+def suggest_channel_names(name: str, present: Iterable[str] = ()) -> list[str]:
     """Return up to three valid channel names similar to `name`, most similar first.
 
     `present` adds names that occur in the data.
 
-    >>> close_matches("angel.boom")[0]
+    >>> suggest_channel_names("angel.boom")[0]
     'angle.boom'
     """
     plain = re.sub(r"[^a-z0-9_.]+", "_", name.strip().lower())
@@ -237,6 +237,6 @@ def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
 
 
 def _unknown_channel_message(name: str) -> str:
-    near = close_matches(name)
+    near = suggest_channel_names(name)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    return f"unknown channel {name!r}; {hint}Valid: {', '.join(valid_kinds())}"
+    return f"unknown channel {name!r}; {hint}Valid: {', '.join(valid_channel_patterns())}"

@@ -202,7 +202,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         joints=names,
         closures=tuple(one.name for one in closures),
         start=np.array([joint.start for joint in joints]),
-        inertia=np.array([body_inertia(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
+        inertia=np.array([body_inertial_parameters(model, b) for b in range(1, model.nbody)]).reshape(-1, 10),
         armature=np.array([joint.armature for joint in joints]),
         damping=np.array([joint.damping for joint in joints]),
         frictionloss=np.array([joint.frictionloss for joint in joints]),
@@ -327,7 +327,7 @@ def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
-def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
+def body_inertial_parameters(model: mujoco.MjModel, body: int) -> list[float]:
     """Return the inertial parameters of a body: mass, first moments, and inertia about its frame's origin.
 
     Args:

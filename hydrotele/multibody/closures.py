@@ -15,22 +15,22 @@ import mujoco
 import numpy as np
 import scipy.optimize
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain, Tree, load_chain
 from hydrotele.multibody.tree_motion import (
     Frames,
-    add,
+    add_vectors,
+    allocate_frames,
     compute_frames,
     cross,
     get_rotation,
     get_vector,
-    make_frames,
     point_acceleration,
-    point_jacobian,
+    point_jacobian_column,
     qr_factor,
     qr_solve,
-    rotate,
+    rotate_vector,
     scale_vector,
 )
 
@@ -41,7 +41,7 @@ _MIN_SINGULAR_RATIO = 1e-7  # minimum relative singular value
 _ERROR_CONTEXT = "closures"
 
 
-@allocation_free
+@compile_without_allocation
 def compute_loop_residuals(tree, frames, error, error_jacobian):
     """Compute the residuals of all loop closure equations and their Jacobian.
 
@@ -63,14 +63,14 @@ def compute_loop_residuals(tree, frames, error, error_jacobian):
         weld = tree.first_equation[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.closure_bodies[c, side], 1.0 - 2.0 * side
-            arm = rotate(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
-            point = add(get_vector(frames.origin, body), arm)
+            arm = rotate_vector(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
+            point = add_vectors(get_vector(frames.origin, body), arm)
             for k in range(3):
                 error[first + k, 0] += sign * point[k]
             for j in range(len(frames.axis)):
                 if not tree.is_moved[body, j]:
                     continue
-                column = point_jacobian(tree, frames, j, point)
+                column = point_jacobian_column(tree, frames, j, point)
                 for k in range(3):
                     error_jacobian[first + k, j] += sign * column[k]
                     if weld and not tree.is_slide[j]:
@@ -81,7 +81,7 @@ def compute_loop_residuals(tree, frames, error, error_jacobian):
                 error[first + 3 + k, 0] = way[k]
 
 
-@allocation_free
+@compile_without_allocation
 def _rotation_error(tree, frames, c):
     """Return the orientation error of a weld closure c as a vector in the world frame.
 
@@ -94,13 +94,13 @@ def _rotation_error(tree, frames, c):
     own, other = tree.closure_rotations[c, 0], tree.closure_rotations[c, 1]
     total = (0.0, 0.0, 0.0)
     for k in range(3):
-        a = rotate(one, (own[0, k], own[1, k], own[2, k]))
-        b = rotate(two, (other[0, k], other[1, k], other[2, k]))
-        total = add(total, cross(b, a))
+        a = rotate_vector(one, (own[0, k], own[1, k], own[2, k]))
+        b = rotate_vector(two, (other[0, k], other[1, k], other[2, k]))
+        total = add_vectors(total, cross(b, a))
     return scale_vector(0.5, total)
 
 
-@allocation_free
+@compile_without_allocation
 def compute_closure_acceleration(tree, frames, out):
     """Compute the second time derivative of the residuals of all loop equations.
 
@@ -117,12 +117,12 @@ def compute_closure_acceleration(tree, frames, out):
         weld = tree.first_equation[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.closure_bodies[c, side], 1.0 - 2.0 * side
-            arm = rotate(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
+            arm = rotate_vector(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
             w, dw = (
                 get_vector(frames.angular_velocity, body),
                 get_vector(frames.angular_acceleration, body),
             )
-            part = add(get_vector(frames.acceleration, body), point_acceleration(w, dw, arm))
+            part = add_vectors(get_vector(frames.acceleration, body), point_acceleration(w, dw, arm))
             for k in range(3):
                 out[first + k, 0] += sign * part[k]
                 if weld:
@@ -161,12 +161,12 @@ def make_loop_workspace(tree, unknowns, columns):
     """
     v, r = len(tree.reference_position), tree.first_equation[-1]
     return LoopWorkspace(
-        np.zeros(v), np.zeros(3), make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
+        np.zeros(v), np.zeros(3), allocate_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
         np.empty((r, unknowns)), np.empty((unknowns, unknowns)), np.empty((unknowns, max(columns, 1))),
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def close_loops_near(tree, q, unknowns, space):
     """Close the loops by Newton's method from a nearby position, without allocating memory.
 
@@ -233,13 +233,13 @@ def close_loops_from(tree: Tree, q: np.ndarray, unknowns: np.ndarray, tolerance:
 def _loop_residuals(tree, q):
     """Return the residuals (r, 1) of the loop equations at joint positions (v,), and their Jacobian (r, v)."""
     v, r = len(q), tree.first_equation[-1]
-    frames, gap, slope, still = make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
+    frames, gap, slope, still = allocate_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
     compute_frames(tree, q, still, still, np.zeros(3), frames)
     compute_loop_residuals(tree, frames, gap, slope)
     return gap, slope
 
 
-def compile_openings() -> None:
+def precompile_loop_residuals() -> None:
     """Compile, before they are needed, the functions that compute loop residuals, with a pendulum as input."""
     body = '<body><joint name="hinge"/><geom size="1"/></body>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
@@ -330,18 +330,18 @@ def find_start_pose(
     if len(chain.closures) and len(position):
         poses = find_assemblies(chain, given, position[0], starts=_START_SEARCHES, seed=seed)
         if not len(poses):
-            raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_opening(chain, given, position[0], 0))
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_unclosed_loop(chain, given, position[0], 0))
         regular = [pose for pose in poses if not find_undetermined_joints(chain, pose, columns)]
         if len(regular) == 1:
             return regular[0]
         if regular:
-            raise InputError(chain.source or _KINEMATICS_CONTEXT, _describe_choice(chain, begin, regular))
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, _describe_ambiguous_assemblies(chain, begin, regular))
     raise InputError(
         chain.source or _ERROR_CONTEXT, f"neither given nor determined by a closure: {', '.join(undetermined)}"
     )
 
 
-def describe_opening(chain: Chain, given: Sequence[str], position: np.ndarray, row: int) -> str:
+def describe_unclosed_loop(chain: Chain, given: Sequence[str], position: np.ndarray, row: int) -> str:
     """Describe, for an error message, which loop stays open at given joint positions, and by how much.
 
     Args:
@@ -385,7 +385,7 @@ def _largest_opening(chain: Chain, q: np.ndarray) -> tuple[str, float]:
     return chain.closures[worst], openings[worst]
 
 
-def _describe_choice(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray]) -> str:
+def _describe_ambiguous_assemblies(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray]) -> str:
     """Describe, for an error message, that the loops can be closed in several ways and list these poses."""
     closure, opening = _largest_opening(chain, start)
     state = f"{closure} is {1e3 * opening:.3g} mm open" if opening > CLOSURE_TOLERANCE else "the pose is singular"
@@ -435,14 +435,16 @@ def solve_joint_positions(
     q = find_start_pose(chain, given, table, start, seed)
     out, first = np.empty((len(table), len(q))), 0
     while first < len(table):
-        failed = _follow_motion(chain.tree, columns, table[first:], others, q, out[first:])
+        failed = _close_loops_along_rows(chain.tree, columns, table[first:], others, q, out[first:])
         if failed < 0:
             break
         first += failed
         last = out[first - 1] if first else np.array(chain.start, float)
         found = find_assemblies(chain, given, table[first], seed=seed)
         if not len(found):
-            raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_opening(chain, given, table[first], first))
+            raise InputError(
+                chain.source or _KINEMATICS_CONTEXT, describe_unclosed_loop(chain, given, table[first], first)
+            )
         q = found[np.argmin(np.linalg.norm(found - last, axis=1))].copy()
         out[first] = q
         first += 1
@@ -450,7 +452,7 @@ def solve_joint_positions(
 
 
 @compiled
-def _follow_motion(tree, given, position, others, q, out):
+def _close_loops_along_rows(tree, given, position, others, q, out):
     """Close the loops row by row along given joint positions, each row from the previous one.
 
     Args:
@@ -528,7 +530,7 @@ def find_assemblies(
 
 def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
     """Return the position and the rotation matrix of one body, or of all bodies if None, as one vector."""
-    frames, still = make_frames(chain.tree), np.zeros(len(q))
+    frames, still = allocate_frames(chain.tree), np.zeros(len(q))
     compute_frames(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1
     return np.concatenate([frames.origin[some].ravel(), frames.rotation[some].ravel()])

@@ -16,28 +16,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.hermite_e import hermegauss
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.closures import (
     close_loops_near,
     compute_closure_acceleration,
-    describe_opening,
+    describe_unclosed_loop,
     find_assemblies,
     find_start_pose,
     make_loop_workspace,
 )
 from hydrotele.multibody.tree_motion import (
     compute_frames,
-    compute_wrenches,
+    compute_unit_wrenches,
     dot,
     get_rotation,
     get_vector,
-    point_jacobian,
+    point_jacobian_column,
     qr_factor,
     qr_solve,
-    rotate,
-    subtract,
+    rotate_vector,
+    subtract_vectors,
 )
 
 _MAX_GIVEN_STEP = 0.1  # rad or m, maximum step of the given joints, so that loops stay on their branch
@@ -122,7 +122,7 @@ def project_on_drives(
     failed = _project_rows(chain.tree, given_rows, others, moved, axes, q, out)
     if failed >= 0:
         if len(chain.closures) and not len(find_assemblies(chain, given, tables[0][failed])):
-            message = describe_opening(chain, given, tables[0][failed], failed)
+            message = describe_unclosed_loop(chain, given, tables[0][failed], failed)
         else:
             message = (
                 f"row {failed}: the loops of {chain.name} cannot be closed there without a jump to another"
@@ -225,7 +225,7 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
                     total += inverse[i, m] * moves[j, m]
                 share[i, j] = total
         for body in range(1, b):
-            compute_wrenches(frames, body, forces, torques)
+            compute_unit_wrenches(frames, body, forces, torques)
             _remove_moment(frames, body, get_vector(moment_free, body), torques)
             _project_wrench(tree, frames, body, forces, torques, share, out.body_projection[row])
         for m in range(len(tree.closure_bodies)):
@@ -233,69 +233,69 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
     return -1
 
 
-@allocation_free
+@compile_without_allocation
 def _remove_moment(frames, body, axis, torques):
     """Remove the component along a unit axis of a body's frame from torques (3, 10) in the world frame.
 
     A zero axis has no effect.
     """
-    way = rotate(get_rotation(frames.rotation, body), axis)
+    way = rotate_vector(get_rotation(frames.rotation, body), axis)
     for m in range(10):
         along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
         for k in range(3):
             torques[k, m] -= along * way[k]
 
 
-@allocation_free
-def _project_wrench(tree, frames, body, forces, torques, share, out):
+@compile_without_allocation
+def _project_wrench(tree, frames, body, forces, torques, joint_projection, out):
     """Project the wrench of a body on the drives by virtual work, through the joints that move it.
 
     Args:
         tree: Tree.
         frames: Frames.
         body: index of the body.
-        forces: (3, 10) force per unit of each inertial parameter, see `compute_wrenches`.
+        forces: (3, 10) force per unit of each inertial parameter, see `compute_unit_wrenches`.
         torques: (3, 10) torque, likewise.
-        share: (k, v) force of drive k per unit force or torque in joint v.
+        joint_projection: (k, v) force of drive k per unit force or torque in joint v.
         out: (k, 10 b) written in the columns of this body: drive forces.
     """
     first, point = 10 * (body - 1), get_vector(frames.origin, body)
-    for i in range(len(share)):
+    for i in range(len(joint_projection)):
         for m in range(10):
             out[i, first + m] = 0.0
-    for j in range(share.shape[1]):
+    for j in range(joint_projection.shape[1]):
         if not tree.is_moved[body, j]:
             continue
-        way, turn = point_jacobian(tree, frames, j, point), get_vector(frames.axis, j)
+        way, turn = point_jacobian_column(tree, frames, j, point), get_vector(frames.axis, j)
         for m in range(10):
             effort = way[0] * forces[0, m] + way[1] * forces[1, m] + way[2] * forces[2, m]
             if not tree.is_slide[j]:
                 effort += turn[0] * torques[0, m] + turn[1] * torques[1, m] + turn[2] * torques[2, m]
-            for i in range(len(share)):
-                out[i, first + m] += share[i, j] * effort
+            for i in range(len(joint_projection)):
+                out[i, first + m] += joint_projection[i, j] * effort
 
 
-@allocation_free
-def _project_closure_friction(tree, frames, closure, share, out):
+@compile_without_allocation
+def _project_closure_friction(tree, frames, closure, joint_projection, out):
     """Project viscous rotational friction in a closure on the drives, per unit of its coefficient.
 
-    `share` (k, v) is the force of drive k per unit force in joint v; column `closure` of `out` (k, c) is
+    `joint_projection` (k, v) is the force of drive k per unit force in joint v; column `closure` of `out` (k, c) is
     written.
 
     Returns:
         Relative rotation rate of the two bodies of the closure [rad/s].
     """
     one, two = tree.closure_bodies[closure, 0], tree.closure_bodies[closure, 1]
-    spin = subtract(get_vector(frames.angular_velocity, one), get_vector(frames.angular_velocity, two))
-    for i in range(len(share)):
+    spin = subtract_vectors(get_vector(frames.angular_velocity, one), get_vector(frames.angular_velocity, two))
+    for i in range(len(joint_projection)):
         out[i, closure] = 0.0
-    for j in range(share.shape[1]):
+    for j in range(joint_projection.shape[1]):
         if tree.is_slide[j] or tree.is_moved[one, j] == tree.is_moved[two, j]:
             continue
         along = dot(get_vector(frames.axis, j), spin)
         along = along if tree.is_moved[one, j] else -along
-        for i in range(len(share)):
-            out[i, closure] += share[i, j] * along
+        for i in range(len(joint_projection)):
+            out[i, closure] += joint_projection[i, j] * along
     return math.sqrt(dot(spin, spin))
 
 
@@ -358,7 +358,7 @@ FRICTION_TERMS = (
 DEVIATION_TERMS = ("low_speed", "reversal")  # deviations near zero speed, with a number: `low_speed_1`
 
 
-def is_deviation(name: str) -> bool:
+def is_friction_deviation(name: str) -> bool:
     """Return whether a parameter name, such as `low_speed_1.knee`, is a friction deviation near zero speed."""
     return name.partition(".")[0].rpartition("_")[0] in DEVIATION_TERMS
 
@@ -418,7 +418,7 @@ def make_regressor(
     drives = tuple(chain.drives if drives is None else drives)
     columns, names, units, nominal = [], [], [], []
 
-    def add(column: np.ndarray | None, name: str, unit: str, value: float) -> None:
+    def add_column(column: np.ndarray | None, name: str, unit: str, value: float) -> None:
         if column is not None:
             columns.append(column[:, :, None])
         names.append(name)
@@ -429,27 +429,27 @@ def make_regressor(
         b = _body_index(chain, body)
         columns.append(projection.body_projection[:, :, 10 * b : 10 * (b + 1)])
         for p, (kind, unit) in enumerate(BODY_PARAMETERS.items()):
-            add(None, f"{kind}.{body}", unit, chain.inertia[b, p])
+            add_column(None, f"{kind}.{body}", unit, chain.inertia[b, p])
     for joint in drive_inertia:
         j = chain.index(joint)
         unit = "kg" if chain.tree.is_slide[j] else "kg m^2"
         column = projection.joint_projection[:, :, j] * projection.acceleration[:, None, j]
-        add(column, f"drive_inertia.{joint}", unit, chain.armature[j])
+        add_column(column, f"drive_inertia.{joint}", unit, chain.armature[j])
     for one in friction:
         for kind, (column, unit) in _friction_columns(chain, projection, one, rate_std).items():
-            add(column, f"{kind}.{one.location}", unit, one.nominal[kind])
+            add_column(column, f"{kind}.{one.location}", unit, one.nominal[kind])
     given = offsets if isinstance(offsets, Mapping) else {}
     for i, drive in enumerate(drives if offsets is not False else ()):
         column = np.zeros(projection.joint_projection.shape[:2])
         column[:, i] = 1.0
         unit = "N" if chain.tree.is_slide[chain.index(drive)] else "N m"
-        add(column, f"offset.{drive}", unit, given.get(drive, 0.0))
+        add_column(column, f"offset.{drive}", unit, given.get(drive, 0.0))
     empty = np.zeros((*projection.joint_projection.shape[:2], 0))
     matrix = np.concatenate([empty, *columns], axis=2)
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
-def sign_uncertainty(
+def friction_sign_std(
     chain: Chain, projection: Projection, drives: Sequence[str], friction: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
@@ -484,7 +484,7 @@ def _friction_columns(chain: Chain, projection: Projection, term: FrictionTerm, 
     A column holds the forces of the k drives per unit of the parameter. With `rate_std` it is the
     expected value over the uncertain rate.
     """
-    strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS and not is_deviation(kind)]
+    strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS and not is_friction_deviation(kind)]
     if strange:
         message = f"friction has no {strange[0]}; valid: {', '.join(FRICTION_TERMS)}"
         raise InputError(_REGRESSOR_CONTEXT, message)
@@ -518,7 +518,7 @@ def _unit_friction(
         return velocity * way
     if kind == "quadratic":
         return velocity**2 * way
-    if is_deviation(kind):
+    if is_friction_deviation(kind):
         shape, _, number = kind.rpartition("_")
         near = np.exp(-((velocity / term.low_speeds[int(number) - 1]) ** 2))
         return near * (way if shape == "low_speed" else np.abs(np.sign(way)) * np.sign(acceleration))

@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import pin_axis
-from hydrotele.machine.machine import Machine, dependent_joints
+from hydrotele.machine.machine import Machine, find_dependent_joints
 
 
-@allocation_free
+@compile_without_allocation
 def factorise_cholesky(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
@@ -39,7 +39,7 @@ def factorise_cholesky(matrix):
             matrix[i, j] = math.sqrt(total) if i == j else total / matrix[j, j]
 
 
-@allocation_free
+@compile_without_allocation
 def solve_cholesky(factor, right):
     """Solve a linear system `L L' x = right` with the lower Cholesky factor L, in place.
 
@@ -63,7 +63,7 @@ def solve_cholesky(factor, right):
         right[i] /= factor[i, i]
 
 
-@allocation_free
+@compile_without_allocation
 def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
     """Compute the frames and Jacobians of all cylinders (bars between two pins).
 
@@ -85,8 +85,8 @@ def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
     for b in range(len(bar)):
         tube, rod = first + 2 * b, first + 2 * b + 1
         base = tree[tube, PARENT]
-        compute_origin(tree, shape, frame, jacobian, tube)
-        compute_origin(tree, shape, frame, jacobian, rod)
+        compute_frame_origin(tree, shape, frame, jacobian, tube)
+        compute_frame_origin(tree, shape, frame, jacobian, rod)
         dx = frame[rod, ORIGIN] - frame[tube, ORIGIN]
         dy = frame[rod, ORIGIN + 1] - frame[tube, ORIGIN + 1]
         dz = frame[rod, ORIGIN + 2] - frame[tube, ORIGIN + 2]
@@ -116,7 +116,7 @@ def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
                 jacobian[i, k, 5] = wz + nz * turn
 
 
-@allocation_free
+@compile_without_allocation
 def compute_bar_motion(tree, first, frame, bar):
     """Compute the motion of all cylinders (bars): spin, accelerations, and rate of their length.
 
@@ -136,8 +136,8 @@ def compute_bar_motion(tree, first, frame, bar):
     for b in range(len(bar)):
         tube, rod = first + 2 * b, first + 2 * b + 1
         base, c = tree[tube, PARENT], bar[b, LENGTH]
-        compute_origin_motion(tree, frame, tube)
-        compute_origin_motion(tree, frame, rod)
+        compute_frame_origin_motion(tree, frame, tube)
+        compute_frame_origin_motion(tree, frame, rod)
         ex, ey, ez = frame[tube, 0], frame[tube, 3], frame[tube, 6]
         nx, ny, nz = -frame[tube, 1], -frame[tube, 4], -frame[tube, 7]
         ux, uy, uz = frame[tube, 2], frame[tube, 5], frame[tube, 8]
@@ -182,7 +182,7 @@ _MAX_DISTANCE = 20.0  # rad or m, distance per call above which steps get larger
 _MAX_DEPENDENT_STEP = 0.3  # rad or m, maximum change of a dependent coordinate per Newton iteration
 
 
-@allocation_free
+@compile_without_allocation
 def close_loops(mech, m, z):
     """Move to independent positions with all loops closed, and compute the dependent rates.
 
@@ -242,7 +242,7 @@ def close_loops(mech, m, z):
     return worst
 
 
-@allocation_free
+@compile_without_allocation
 def compute_drift(mech, m):
     """Compute the accelerations of the dependent coordinates at zero independent accelerations.
 
@@ -260,8 +260,8 @@ def compute_drift(mech, m):
     for row in range(len(m.loop)):
         i = first + 2 * (row // 3)
         if row % 3 == 0:
-            compute_origin_motion(mech.tree, m.frame, i)
-            compute_origin_motion(mech.tree, m.frame, i + 1)
+            compute_frame_origin_motion(mech.tree, m.frame, i)
+            compute_frame_origin_motion(mech.tree, m.frame, i + 1)
         at = ACCELERATION + row % 3
         m.loop[row, n + 1] = m.frame[i, at] - m.frame[i + 1, at]
     _solve_loops(mech.dependent, m.loop, n + 1, m.normal)
@@ -269,7 +269,7 @@ def compute_drift(mech, m):
         m.joint[DRIFT, mech.dependent[b]] = m.normal[len(mech.dependent), b]
 
 
-@allocation_free
+@compile_without_allocation
 def _compute_residuals(tree, shape, first, frame, jacobian, loop):
     """Compute the residuals of all closures and their Jacobian, and write them to `loop`.
 
@@ -283,8 +283,8 @@ def _compute_residuals(tree, shape, first, frame, jacobian, loop):
     for row in range(len(loop)):
         i, r = first + 2 * (row // 3), row % 3
         if r == 0:
-            compute_origin(tree, shape, frame, jacobian, i)
-            compute_origin(tree, shape, frame, jacobian, i + 1)
+            compute_frame_origin(tree, shape, frame, jacobian, i)
+            compute_frame_origin(tree, shape, frame, jacobian, i + 1)
         loop[row, n] = frame[i, ORIGIN + r] - frame[i + 1, ORIGIN + r]
         worst = max(worst, abs(loop[row, n]))
         for k in range(n):
@@ -292,7 +292,7 @@ def _compute_residuals(tree, shape, first, frame, jacobian, loop):
     return worst
 
 
-@allocation_free
+@compile_without_allocation
 def _factorise_loops(bound, loop, normal):
     """Factorise the normal matrix A'A of the loop equations for the dependent coordinates.
 
@@ -311,7 +311,7 @@ def _factorise_loops(bound, loop, normal):
     factorise_cholesky(normal)
 
 
-@allocation_free
+@compile_without_allocation
 def _solve_loops(bound, loop, column, normal):
     """Solve the loop equations `A x = -loop[:, column]` for the dependent coordinates by least squares.
 
@@ -433,7 +433,7 @@ def make_reduced_mechanism(machine: Machine) -> ReducedMechanism:
     for pin in (pin for closure in machine.closures.values() for pin in (closure.a, closure.b)):
         tree.append((index[pin.link], PIN, -1))
         shape.append(_shape_row(pin.position))
-    following = dependent_joints(machine)
+    following = find_dependent_joints(machine)
     return ReducedMechanism(
         tree=_append_coordinate_end(np.array(tree, int)),
         shape=np.array(shape),
@@ -542,7 +542,7 @@ def make_reduced_motion(mech: ReducedMechanism) -> ReducedMotion:
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def cross(ax, ay, az, bx, by, bz):
     """Return the cross product of two vectors given by their components.
 
@@ -562,7 +562,7 @@ def cross(ax, ay, az, bx, by, bz):
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@allocation_free
+@compile_without_allocation
 def rotate_to_world(frame, i, x, y, z):
     """Rotate a vector from a frame to the axes of the world.
 
@@ -585,8 +585,8 @@ def rotate_to_world(frame, i, x, y, z):
     )
 
 
-@allocation_free
-def compute_origin(tree, shape, frame, jacobian, i):
+@compile_without_allocation
+def compute_frame_origin(tree, shape, frame, jacobian, i):
     """Compute the world position of a frame's origin and its Jacobian, as a point fixed to the parent frame.
 
     Args:
@@ -616,13 +616,13 @@ def compute_origin(tree, shape, frame, jacobian, i):
         jacobian[i, k, 5] = wz
 
 
-@allocation_free
-def compute_origin_motion(tree, frame, i):
+@compile_without_allocation
+def compute_frame_origin_motion(tree, frame, i):
     """Compute velocity, spin and accelerations of a frame as if it were fixed to its parent.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
-        frame: (f, FRAME_SIZE) frames after `compute_origin`; the motion of frame i is written.
+        frame: (f, FRAME_SIZE) frames after `compute_frame_origin`; the motion of frame i is written.
         i: index of the frame.
 
     Returns:
@@ -649,8 +649,8 @@ def compute_origin_motion(tree, frame, i):
     frame[i, SPIN_RATE], frame[i, SPIN_RATE + 1], frame[i, SPIN_RATE + 2] = ax, ay, az
 
 
-@allocation_free
-def _rotate(frame, i, p, x, y, z, angle):
+@compile_without_allocation
+def _rotate_frame_about_axis(frame, i, p, x, y, z, angle):
     """Set the orientation of frame i to that of frame p, rotated about an axis (x, y, z) of p by an angle [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     k = 1.0 - c
@@ -664,7 +664,7 @@ def _rotate(frame, i, p, x, y, z, angle):
         frame[i, r + 2] = a * r02 + b * r12 + d * r22
 
 
-@allocation_free
+@compile_without_allocation
 def compute_link_frames(tree, shape, links, joint, frame, jacobian):
     """Compute pose and Jacobian of every link from the joint positions (forward kinematics).
 
@@ -683,11 +683,11 @@ def compute_link_frames(tree, shape, links, joint, frame, jacobian):
     """
     for i in range(1, 1 + links):
         p, j = tree[i, PARENT], tree[i, COORDINATE]
-        compute_origin(tree, shape, frame, jacobian, i)
+        compute_frame_origin(tree, shape, frame, jacobian, i)
         lx, ly, lz = shape[i, AXIS], shape[i, AXIS + 1], shape[i, AXIS + 2]
         x, y, z = rotate_to_world(frame, p, lx, ly, lz)
         if tree[i, KIND] == HINGE:
-            _rotate(frame, i, p, lx, ly, lz, joint[Q, j])
+            _rotate_frame_about_axis(frame, i, p, lx, ly, lz, joint[Q, j])
             jacobian[i, j, 3], jacobian[i, j, 4], jacobian[i, j, 5] = x, y, z
             continue
         for r in range(9):
@@ -705,7 +705,7 @@ def compute_link_frames(tree, shape, links, joint, frame, jacobian):
             jacobian[i, j, 0], jacobian[i, j, 1], jacobian[i, j, 2] = x, y, z
 
 
-@allocation_free
+@compile_without_allocation
 def compute_link_motion(tree, links, joint, frame, jacobian):
     """Compute velocity, spin and accelerations of every link from the joint rates.
 
@@ -724,7 +724,7 @@ def compute_link_motion(tree, links, joint, frame, jacobian):
     Source: differential kinematics of a tree.
     """
     for i in range(1, 1 + links):
-        compute_origin_motion(tree, frame, i)
+        compute_frame_origin_motion(tree, frame, i)
         if tree[i, KIND] != HINGE and tree[i, KIND] != SLIDE:
             continue
         p, j = tree[i, PARENT], tree[i, COORDINATE]
@@ -741,7 +741,7 @@ def compute_link_motion(tree, links, joint, frame, jacobian):
         frame[i, second + 2] += twice * tz * rate
 
 
-@allocation_free
+@compile_without_allocation
 def compute_mass_and_bias(mech, m):
     """Compute the mass matrix and bias forces of the tree with its bars (Kane's projection).
 
@@ -779,7 +779,7 @@ def compute_mass_and_bias(mech, m):
             m.mass[j, i] = mass
 
 
-@allocation_free
+@compile_without_allocation
 def _compute_body_wrench(shape, frame, jacobian, b, reach, momentum):
     """Compute momentum per unit joint rate of body b, and its wrench of inertia and gravity.
 

@@ -9,61 +9,61 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 
 
-@allocation_free
+@compile_without_allocation
 def get_vector(rows, k):
     """Return row k of an (n, 3) array as a tuple (x, y, z)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
-@allocation_free
+@compile_without_allocation
 def set_vector(rows, k, a):
     """Write a tuple (x, y, z) into row k of an (n, 3) array."""
     rows[k, 0], rows[k, 1], rows[k, 2] = a
 
 
-@allocation_free
-def add(a, b):
+@compile_without_allocation
+def add_vectors(a, b):
     """Return the sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@allocation_free
-def subtract(a, b):
+@compile_without_allocation
+def subtract_vectors(a, b):
     """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@allocation_free
+@compile_without_allocation
 def scale_vector(s, a):
     """Return a vector times a scalar."""
     return s * a[0], s * a[1], s * a[2]
 
 
-@allocation_free
+@compile_without_allocation
 def dot(a, b):
     """Return the scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@allocation_free
+@compile_without_allocation
 def cross(a, b):
     """Return the cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@allocation_free
+@compile_without_allocation
 def point_acceleration(w, dw, arm):
     """Return the acceleration `dw x r + w x (w x r)` of a body's point at r = `arm` from its fixed origin.
 
     w and dw are angular velocity [rad/s] and angular acceleration [rad/s^2].
     """
-    return add(cross(dw, arm), cross(w, cross(w, arm)))
+    return add_vectors(cross(dw, arm), cross(w, cross(w, arm)))
 
 
-@allocation_free
+@compile_without_allocation
 def get_rotation(rows, k):
     """Return matrix k of an (n, 3, 3) array as three row vectors."""
     m = rows[k]
@@ -72,7 +72,7 @@ def get_rotation(rows, k):
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def set_rotation(rows, k, r):
     """Write three row vectors into matrix k of an (n, 3, 3) array."""
     m = rows[k]
@@ -81,25 +81,25 @@ def set_rotation(rows, k, r):
     m[2, 0], m[2, 1], m[2, 2] = r[2]
 
 
-@allocation_free
-def rotate(r, a):
+@compile_without_allocation
+def rotate_vector(r, a):
     """Return the vector a, rotated by the rotation matrix r (three row vectors)."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
-@allocation_free
-def rotate_back(r, a):
+@compile_without_allocation
+def rotate_vector_back(r, a):
     """Return the vector a, rotated by the inverse (transpose) of the rotation matrix r."""
-    return add(add(scale_vector(a[0], r[0]), scale_vector(a[1], r[1])), scale_vector(a[2], r[2]))
+    return add_vectors(add_vectors(scale_vector(a[0], r[0]), scale_vector(a[1], r[1])), scale_vector(a[2], r[2]))
 
 
-@allocation_free
+@compile_without_allocation
 def compose_rotations(r, s):
     """Return the rotation r s, which applies s first and then r."""
-    return rotate_back(s, r[0]), rotate_back(s, r[1]), rotate_back(s, r[2])
+    return rotate_vector_back(s, r[0]), rotate_vector_back(s, r[1]), rotate_vector_back(s, r[2])
 
 
-@allocation_free
+@compile_without_allocation
 def axis_rotation(axis, angle):
     """Return the rotation matrix (three row vectors) about a unit axis by an angle [rad] (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
@@ -115,7 +115,7 @@ def axis_rotation(axis, angle):
 _MIN_RANK_RATIO = 1e-7  # minimum ratio of an orthogonalised column to the largest one for full rank
 
 
-@allocation_free
+@compile_without_allocation
 def qr_factor(matrix, columns, q, r):
     """Compute the QR factorisation of selected columns of a matrix, by modified Gram-Schmidt done twice.
 
@@ -153,7 +153,7 @@ def qr_factor(matrix, columns, q, r):
     return True
 
 
-@allocation_free
+@compile_without_allocation
 def qr_solve(q, r, count, right, column, answer, k):
     """Solve a least-squares problem with the factors q and r of `qr_factor` for `count` unknowns.
 
@@ -194,7 +194,7 @@ class Frames(NamedTuple):
 
 
 @compiled
-def make_frames(tree):
+def allocate_frames(tree):
     """Allocate arrays for positions and motion of all bodies and joint axes of a joint tree."""
     b, v = len(tree.parent), len(tree.reference_position)
     return Frames(
@@ -203,7 +203,7 @@ def make_frames(tree):
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def compute_frames(tree, q, rate, acceleration, ground, frames):
     """Compute poses, velocities and accelerations of all bodies from the motion of the joints.
 
@@ -227,29 +227,31 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
             get_vector(frames.angular_velocity, up),
             get_vector(frames.angular_acceleration, up),
         )
-        arm = rotate(t, get_vector(tree.offset, b))
-        p = add(get_vector(frames.origin, up), arm)
-        a = add(get_vector(frames.acceleration, up), point_acceleration(w, dw, arm))
+        arm = rotate_vector(t, get_vector(tree.offset, b))
+        p = add_vectors(get_vector(frames.origin, up), arm)
+        a = add_vectors(get_vector(frames.acceleration, up), point_acceleration(w, dw, arm))
         t = compose_rotations(t, get_rotation(tree.rotation, b))
         for j in range(tree.first_joint[b], tree.first_joint[b + 1]):
             own, center = get_vector(tree.axis, j), get_vector(tree.anchor, j)
-            way, arm = rotate(t, own), rotate(t, center)
+            way, arm = rotate_vector(t, own), rotate_vector(t, center)
             set_vector(frames.axis, j, way)
-            set_vector(frames.anchor, j, add(p, arm))
+            set_vector(frames.anchor, j, add_vectors(p, arm))
             step, turning = q[j] - tree.reference_position[j], cross(w, way)
             if tree.is_slide[j]:
                 arm = scale_vector(step, way)
-                a = add(a, point_acceleration(w, dw, arm))
-                a = add(a, add(scale_vector(2.0 * rate[j], turning), scale_vector(acceleration[j], way)))
-                p = add(p, arm)
+                a = add_vectors(a, point_acceleration(w, dw, arm))
+                a = add_vectors(
+                    a, add_vectors(scale_vector(2.0 * rate[j], turning), scale_vector(acceleration[j], way))
+                )
+                p = add_vectors(p, arm)
                 continue
-            a = add(a, point_acceleration(w, dw, arm))
-            dw = add(dw, add(scale_vector(acceleration[j], way), scale_vector(rate[j], turning)))
-            w = add(w, scale_vector(rate[j], way))
+            a = add_vectors(a, point_acceleration(w, dw, arm))
+            dw = add_vectors(dw, add_vectors(scale_vector(acceleration[j], way), scale_vector(rate[j], turning)))
+            w = add_vectors(w, scale_vector(rate[j], way))
             t = compose_rotations(t, axis_rotation(own, step))
-            back = scale_vector(-1.0, rotate(t, center))
-            a = add(a, point_acceleration(w, dw, back))
-            p = add(add(p, arm), back)
+            back = scale_vector(-1.0, rotate_vector(t, center))
+            a = add_vectors(a, point_acceleration(w, dw, back))
+            p = add_vectors(add_vectors(p, arm), back)
         set_vector(frames.origin, b, p)
         set_rotation(frames.rotation, b, t)
         set_vector(frames.angular_velocity, b, w)
@@ -257,18 +259,18 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
         set_vector(frames.acceleration, b, a)
 
 
-@allocation_free
-def point_jacobian(tree, frames, j, point):
+@compile_without_allocation
+def point_jacobian_column(tree, frames, j, point):
     """Return the velocity of a point per unit rate of joint j, in the world frame.
 
     This is a column of the point's Jacobian. The joint must move the point.
     """
     way = get_vector(frames.axis, j)
-    return way if tree.is_slide[j] else cross(way, subtract(point, get_vector(frames.anchor, j)))
+    return way if tree.is_slide[j] else cross(way, subtract_vectors(point, get_vector(frames.anchor, j)))
 
 
-@allocation_free
-def compute_wrenches(frames, body, forces, torques):
+@compile_without_allocation
+def compute_unit_wrenches(frames, body, forces, torques):
     """Compute force and torque that a body's motion requires, per unit of its ten inertial parameters.
 
     `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with mass m, acceleration a of
@@ -283,7 +285,7 @@ def compute_wrenches(frames, body, forces, torques):
         f, n = point_acceleration(w, dw, way), cross(way, a)
         for m in range(3):
             forces[m, 1 + k], torques[m, 1 + k] = f[m], n[m]
-    v, dv = rotate_back(t, w), rotate_back(t, dw)
+    v, dv = rotate_vector_back(t, w), rotate_vector_back(t, dw)
     for p in range(6):
         i, j = _INERTIA_PAIRS[p, 0], _INERTIA_PAIRS[p, 1]
         x, y, z = 0.0, 0.0, 0.0  # I w, with a unit at (i, j) and (j, i)
@@ -299,6 +301,6 @@ def compute_wrenches(frames, body, forces, torques):
                 y, dy = v[i], dv[i]
             else:
                 z, dz = v[i], dv[i]
-        n = rotate(t, add((dx, dy, dz), cross(v, (x, y, z))))
+        n = rotate_vector(t, add_vectors((dx, dy, dz), cross(v, (x, y, z))))
         for m in range(3):
             forces[m, 4 + p], torques[m, 4 + p] = 0.0, n[m]

@@ -104,13 +104,13 @@ class SwitchedCommands:
         """
         self.commands = [0.0] * count
 
-    def step_up(self, number: int) -> None:
+    def raise_command(self, number: int) -> None:
         """Increase the command of the axis with this index by one step: -1 to 0, or 0 to 1."""
-        self._set(number, lambda now: min(1.0, now + 1.0))
+        self._change_command(number, lambda now: min(1.0, now + 1.0))
 
-    def step_down(self, number: int) -> None:
+    def lower_command(self, number: int) -> None:
         """Decrease the command of the axis with this index by one step: 1 to 0, or 0 to -1."""
-        self._set(number, lambda now: max(-1.0, now - 1.0))
+        self._change_command(number, lambda now: max(-1.0, now - 1.0))
 
     def cycle_command(self, number: int) -> None:
         """Advance the command of the axis with this index in the cycle 0, 1, 0, -1.
@@ -122,13 +122,13 @@ class SwitchedCommands:
             self._next_direction = -self._next_direction if now else self._next_direction
             self.commands[number] = 0.0 if now else self._next_direction
 
-    def reset_all(self) -> None:
+    def zero_all_commands(self) -> None:
         """Set all commands to 0."""
         self.commands = [0.0] * len(self.commands)
 
     _next_direction = 1.0
 
-    def _set(self, number: int, step) -> None:
+    def _change_command(self, number: int, step) -> None:
         if number < len(self.commands):
             self.commands[number] = step(self.commands[number])
 
@@ -243,10 +243,10 @@ class Keyboard:
             self._axes[axis] = min(1.0, max(-1.0, self._axes[axis] + way * KEY_STEP))
         elif code in SWITCH_KEYS:
             _, number, way = SWITCH_KEYS[code]
-            (self._switches.step_up if way > 0.0 else self._switches.step_down)(number)
+            (self._switches.raise_command if way > 0.0 else self._switches.lower_command)(number)
         elif code == CENTRE_KEY:
             self._axes = dict.fromkeys(AXES, 0.0)
-            self._switches.reset_all()
+            self._switches.zero_all_commands()
         elif code == QUIT_KEY:
             self._quit = True
 
@@ -283,7 +283,7 @@ class JoystickDevice:
             before, self._stick = self._stick, self._sticks.find(self._kind)
             if self._stick is None and before is not None:
                 said = f"the {self._kind} is unplugged: the handle returns to its centre"
-                self._switches.reset_all()
+                self._switches.zero_all_commands()
                 self._pressed_buttons = set()
             elif before is None and self._stick is not None:
                 said = f"the {self._kind} is connected again"
@@ -305,10 +305,10 @@ class JoystickDevice:
         fresh, self._pressed_buttons = held - self._pressed_buttons, held
         switches, layout = self._switches, self._layout
         for way, act, number in (
-            ("up", switches.step_up, 0),
-            ("down", switches.step_down, 0),
-            ("right", switches.step_up, 1),
-            ("left", switches.step_down, 1),
+            ("up", switches.raise_command, 0),
+            ("down", switches.lower_command, 0),
+            ("right", switches.raise_command, 1),
+            ("left", switches.lower_command, 1),
         ):
             if way in fresh:
                 act(number)
@@ -317,7 +317,7 @@ class JoystickDevice:
                 switches.cycle_command(number)
         together = len(layout.cycle_buttons) > 1 and {str(b) for b in layout.cycle_buttons} <= held
         if str(layout.stop_button) in fresh or together:
-            switches.reset_all()
+            switches.zero_all_commands()
         return str(layout.quit_button) in fresh
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ from hydrotele.run.devices import Device, Reading, SwitchedCommands
 from hydrotele.run.run import Run, Session, finish_run, start_session
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import ButtonCommand, FollowPath, LiveOperator, TeleopPilot
-from hydrotele.simulate.record import surrounding_bodies, total_contact_force
+from hydrotele.simulate.record import mark_surrounding_bodies, total_contact_force
 
 HAPTIC = "haptic"
 _ENGAGED_MESSAGE = "the haptic device moves the machine"
@@ -30,7 +30,7 @@ LOCAL_HOST = "127.0.0.1"
 HAPTIC_CONTROL_RATE = 1000.0  # Hz, control rate with a haptic device; one physics step per tick
 
 
-def haptic_address(device: str) -> tuple[str, int]:
+def parse_haptic_address(device: str) -> tuple[str, int]:
     """Return host and port of a haptic device from `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
 
     Args:
@@ -42,7 +42,7 @@ def haptic_address(device: str) -> tuple[str, int]:
     Raises:
         InputError: the value has another form.
 
-    >>> haptic_address("haptic:10.0.0.7")
+    >>> parse_haptic_address("haptic:10.0.0.7")
     ('10.0.0.7', 5610)
     """
     parts = device.split(":")
@@ -77,7 +77,7 @@ class HapticHandle:
         self.link, self._switches = HapticLink(host, port), SwitchedCommands(further)
         self._count, self._pressed_buttons, self._state = further, 0, "new"
 
-    def attach(self, session: Session) -> None:
+    def replace_simulated_joystick(self, session: Session) -> None:
         """Replace the simulated joystick of a session by this haptic device.
 
         From then on, the session sends its forces to the device and uses the measured handle motion.
@@ -115,7 +115,7 @@ class HapticHandle:
             return _ENGAGED_MESSAGE if engaged else "a haptic device is connected: centre its handle"
         if before == "new":
             return "no haptic device responds yet: start hydrotele haptic-device"
-        self._switches.reset_all()
+        self._switches.zero_all_commands()
         return "the haptic device does not respond: the machine gets no command"
 
     def close(self) -> None:
@@ -324,7 +324,7 @@ TickCallback = Callable[[Session, Callable[[], Status], float], bool]
 """Callback after every tick: session, status function, wall-clock time [s]; False stops the run."""
 
 
-def additional_axes(machine: Machine) -> dict[str, float]:
+def axes_not_moved_by_joystick(machine: Machine) -> dict[str, float]:
     """Return machine axis -> command limit, for the axes that the joystick does not move.
 
     The limit is 1 for valves and in the unit of the drive for others.
@@ -337,12 +337,12 @@ def additional_axes(machine: Machine) -> dict[str, float]:
     }
 
 
-def with_live_operator(scenario: Scenario, further: Iterable[str]) -> Scenario:
+def with_live_operator(scenario: Scenario, button_axes: Iterable[str]) -> Scenario:
     """Return a copy of a teleoperated scenario whose operator is a live user.
 
     Args:
         scenario: a scenario with `pilot.kind: teleop`.
-        further: axes that the user commands with buttons, because the joystick does not move them.
+        button_axes: axes that the user commands with buttons, because the joystick does not move them.
 
     Raises:
         InputError: the scenario has no joystick.
@@ -351,7 +351,7 @@ def with_live_operator(scenario: Scenario, further: Iterable[str]) -> Scenario:
     if not isinstance(pilot, TeleopPilot):
         message = f"pilot kind {pilot.kind} has no joystick; use a scenario with `kind: teleop`"
         raise InputError(f"scenario {scenario.name}", message)
-    buttons = [ButtonCommand(start=0.0, axis=name, command=0.0) for name in further]
+    buttons = [ButtonCommand(start=0.0, axis=name, command=0.0) for name in button_axes]
     update = {"operator": LiveOperator(kind="live"), "buttons": buttons}
     return scenario.model_copy(update={"pilot": pilot.model_copy(update=update)})
 
@@ -377,7 +377,7 @@ def drive_scenario(
         InputError: the scenario does not fit the machine, or the run is too short for a log.
         SimulationFailed: states became infinite or not a number.
     """
-    further = additional_axes(machine)
+    further = axes_not_moved_by_joystick(machine)
     hand = LiveHandReference(further)
     session = start_session(with_live_operator(scenario, further), hand)
     station = session.station
@@ -385,7 +385,7 @@ def drive_scenario(
     hand.travel_range = station.deadbands_and_stops
     haptic = device if isinstance(device, HapticHandle) else None
     if haptic:
-        haptic.attach(session)
+        haptic.replace_simulated_joystick(session)
     handle = station.log.master("handle")
     status, told = _make_status_function(session, further), _MessageReporter(session, say)
     every = station.operator.ticks_per_decision
@@ -449,7 +449,7 @@ class _MessageReporter:
 def _make_status_function(session: Session, further: Iterable[str]) -> Callable[[], Status]:
     plant, station = session.plant, session.station
     assert station
-    around = surrounding_bodies(plant)
+    around = mark_surrounding_bodies(plant)
     handle, hand = station.log.master("handle"), station.log.master("hand")
     places = [plant.axes.index(name) for name in further]
 

@@ -14,11 +14,11 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import parse_json
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
-from hydrotele.machine.signals import default_unit
-from hydrotele.scenario.scenario import logged_soil
+from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.machine.signals import default_channel_unit
+from hydrotele.scenario.scenario import read_soil_from_log
 from hydrotele.simulate.feedback import apply_sensor_errors
-from hydrotele.simulate.mechanism import flexible_axes
+from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import (
     Record,
@@ -120,7 +120,7 @@ def replay_log(
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
     ground = log.metadata.get("ground") == "yes"
-    plant = build_plant(machine, period / steps, ground, logged_soil(log) if ground else ())
+    plant = build_plant(machine, period / steps, ground, read_soil_from_log(log) if ground else ())
     missing = [c for c in _required_channels(plant) if c not in log]
     if missing:
         raise InputError(
@@ -142,7 +142,7 @@ def replay_log(
         time=log.time, columns=values, units=units, source=f"replay of {log.source}",
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
     )  # fmt: skip
-    return Replay(log, simulated, _differences(log, simulated, machine), factor)
+    return Replay(log, simulated, _compute_channel_differences(log, simulated, machine), factor)
 
 
 def _used_rows(log: Log, channel: str) -> np.ndarray:
@@ -198,7 +198,7 @@ def _initial_state_from_metadata(plant: Plant, log: Log) -> dict[str, Any]:
         start["joints"] = {name: float(_read_finite_vector(joints, name)) for name in joints}
         for key in ("drive", "drive_velocity"):
             sides = dict(state.get(key, {}))
-            known = flexible_axes(plant.machine)
+            known = axes_with_transmission(plant.machine)
             start[key] = {name: float(_read_finite_vector(sides, name)) for name in sides if name in known}
         for key in ("bristle", "delivery", "added_delivery"):
             owners = dict(state.get(key, {}))
@@ -246,9 +246,9 @@ def _simulate_commands(plant: Plant, data, times, commands, steps, progress) -> 
     return recorder.to_record()
 
 
-def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:
+def _compute_channel_differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:
     name = log.metadata.get("sensors", "")
-    sensors = get_sensors(machine, name) if name in machine.sensors else None
+    sensors = get_sensor_set(machine, name) if name in machine.sensors else None
     table = {}
     for channel in log.columns:
         kind = channel.partition(".")[0]
@@ -262,9 +262,9 @@ def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, Channe
         table[channel] = ChannelDifference(
             rms=float(np.sqrt(np.mean(error**2))),
             max=float(np.abs(error).max()),
-            unit=log.units.get(channel) or default_unit(channel),
+            unit=log.units.get(channel) or default_channel_unit(channel),
             range=span,
-            noise_rms=noise_rms(machine, sensors, channel),
+            noise_rms=reading_noise_rms(machine, sensors, channel),
         )
     return table
 

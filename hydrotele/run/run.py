@@ -40,7 +40,7 @@ from hydrotele.core.memory import address_record, float64_view, int64_view, matr
 from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, get_sensors
+from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Scenario, find_local_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
@@ -48,7 +48,7 @@ from hydrotele.simulate.audit import compute_balance_errors, full_physics_state
 from hydrotele.simulate.closure import max_pin_opening, pin_sites
 from hydrotele.simulate.feedback import Feedback, create_feedback, simulate_readings
 from hydrotele.simulate.joystick import FLOTOR_DTYPE
-from hydrotele.simulate.mechanism import flexible_axes
+from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import (
     CONTACTS_DTYPE,
@@ -211,12 +211,12 @@ def update_max_pin_opening(ticks):
     widest[0] = max(widest[0], max_pin_opening(places, one, two))
 
 
-def start_compilation() -> None:
+def start_background_compilation() -> None:
     """Start to compile the tick loop of a teleoperated run in a separate process."""
     compile_in_background(run_teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
 
 
-def compile_ticks() -> None:
+def compile_tick_loop() -> None:
     """Compile the tick loop of a teleoperated run."""
     records = (
         TICK_LOOP_RECORD,
@@ -348,7 +348,7 @@ class Session:
         )
         self._records = (
             self._ticks.record, self._stepper.record, self._planned, *self._recorder.native_records(data),
-            *(self.station.records if self.station else ()),
+            *(self.station.memory_records if self.station else ()),
         )  # fmt: skip
         self._begin = 0.0
         self.tick = 0
@@ -396,7 +396,7 @@ class Session:
         if self.tick < 0:
             raise self._recorder.instability_error((-1 - self.tick) // self.ticks_per_row)
         if station and self.tick < end:
-            stopped = station.check_safety(self.tick)
+            stopped = station.run_safety_checks(self.tick)
             step_planned_run(stepper.record, self._planned, self.tick, stepper.steps, stopped)
             update_max_pin_opening(self._ticks.record)
             self.tick += 1
@@ -624,14 +624,14 @@ def load_simulated_machine(scenario: Scenario) -> Machine:
     return machine
 
 
-def prepare(scenario: Scenario) -> PreparedRun:
+def prepare_run(scenario: Scenario) -> PreparedRun:
     """Build the simulated machine of a scenario, set its initial state and plan the run.
 
     Raises:
         InputError: the scenario does not fit the machine.
     """
     machine = load_simulated_machine(scenario)
-    sensors = get_sensors(machine, scenario.sensors)
+    sensors = get_sensor_set(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
     data, start = _initial_data(plant, scenario)
     times = np.arange(scenario.tick_count) / scenario.control_rate
@@ -679,8 +679,8 @@ def start_session(scenario: Scenario, hand: HandInput | None = None) -> Session:
         InputError: the scenario does not fit the machine.
     """
     if isinstance(scenario.pilot, TeleopPilot):
-        start_compilation()
-    return Session(prepare(scenario), scenario, load_nominal_machine(scenario), hand)
+        start_background_compilation()
+    return Session(prepare_run(scenario), scenario, load_nominal_machine(scenario), hand)
 
 
 def finish_run(session: Session, scenario: Scenario) -> Run:
@@ -695,7 +695,7 @@ def finish_run(session: Session, scenario: Scenario) -> Run:
     """
     looped, plant = session.finish(), session.plant
     plan, record = looped.plan, looped.record
-    truth, measured = _logs(plant, scenario, record, session.sensor_feedback)
+    truth, measured = _make_logs(plant, scenario, record, session.sensor_feedback)
     summary = summarise(plant, scenario, plan, record, looped.max_pin_opening, looped.computing_seconds)
     if looped.station:
         measured = _add_station_channels(measured, looped.station.log, scenario)
@@ -730,7 +730,7 @@ def _add_station_channels(log: Log, station: TeleoperationLog, scenario: Scenari
     return dataclasses.replace(log, columns={**log.columns, **columns}, units={**log.units, **units})
 
 
-def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
+def _make_logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
     """Return the log of the true values and the log of the sensor readings of a run.
 
     Args:
@@ -741,20 +741,20 @@ def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> t
     """
     machine = plant.machine
     values, units = true_channels(plant, record)
-    truth = _log(scenario, machine, record.time, values, units, "ideal")
-    state = json.dumps(_initial_state(plant, record))
+    truth = _make_log(scenario, machine, record.time, values, units, "ideal")
+    state = json.dumps(_describe_initial_state(plant, record))
     things = json.dumps([thing.model_dump() for thing in scenario.surroundings])
     known = {"initial_state": state} | ({"surroundings": things} if scenario.surroundings else {})
     truth = dataclasses.replace(truth, metadata={**truth.metadata, **known})
     per_row = round(scenario.control_rate / scenario.log_rate) // seen.ticks_per_sample
     errors = {name: e[::per_row][: scenario.row_count] for name, e in seen.errors.items()}
     visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
-    sensors = get_sensors(machine, scenario.sensors)
+    sensors = get_sensor_set(machine, scenario.sensors)
     readings = {c: v for c, v in values.items() if c.startswith("command.")}
     visible |= delayed_channels(plant, record)
     readings |= simulate_readings(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
     units = {c: units[c] for c in readings}
-    return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
+    return truth, _make_log(scenario, machine, record.time, readings, units, scenario.sensors)
 
 
 def _initial_data(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
@@ -787,7 +787,7 @@ def _initial_data(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict
     return data, joints
 
 
-def _log(scenario, machine, time, values, units, sensors: str) -> Log:
+def _make_log(scenario, machine, time, values, units, sensors: str) -> Log:
     metadata = {
         "machine": machine.name,
         "tool": machine.tool,
@@ -806,12 +806,12 @@ def _log(scenario, machine, time, values, units, sensors: str) -> Log:
     return Log(time=time, columns=values, units=units, metadata=metadata, source=scenario.name)
 
 
-def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
+def _describe_initial_state(plant: Plant, record: Record) -> dict[str, Any]:
     act = record.act[0, : ACTIVATIONS_PER_AXIS * plant.hydraulic].reshape(plant.hydraulic, ACTIVATIONS_PER_AXIS)
     keys = ("spool", "spool_rate", "pressure_head", "pressure_rod")
     driven = {axis.joint for axis in plant.machine.axes.values()}
     free = [n for n in plant.machine.joints if n not in driven]
-    flexible = {n: plant.axes.index(n) for n in flexible_axes(plant.machine)}
+    flexible = {n: plant.axes.index(n) for n in axes_with_transmission(plant.machine)}
     qpos, qvel = record.qpos[0], record.qvel[0]
     drives = {
         "drive": {n: float(qpos[plant.drive_qpos[i]]) for n, i in flexible.items()},
@@ -824,11 +824,11 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
         **{key: act[:, column].tolist() for column, key in enumerate(keys)},
         "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
         **(drives if flexible else {}),
-        **_internal_states(plant, record),
+        **_initial_internal_states(plant, record),
     }
 
 
-def _internal_states(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
+def _initial_internal_states(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
     """Return the states in addition to motion, spools and pressures at the first row of a run.
 
     They belong to friction before sliding, pump and added effects: kind -> owner -> value.

@@ -42,10 +42,10 @@ from hydrotele.run.sweep_facts import (
     SweepBase,
     SweepFile,
     check_points,
-    fingerprint,
+    hash_scenario,
     iterate_points,
-    open_base,
-    scenario_of,
+    make_point_scenario,
+    read_base_scenario,
 )
 from hydrotele.run.sweep_runs import (
     FAILED,
@@ -166,7 +166,7 @@ _FORCE_AND_BALANCE_FIGURES = (
 )  # fmt: skip
 
 
-def choose_figures(table: SweepTable) -> list[str]:
+def choose_plotted_numbers(table: SweepTable) -> list[str]:
     """Return the names of up to six numbers to plot: tracking errors, forces, balances.
 
     Only numbers that differ between the runs are chosen.
@@ -328,7 +328,7 @@ def sweep_identity(base: SweepBase, checked: CheckedSweep) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fresh: bool) -> Iterator[None]:
+def open_sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fresh: bool) -> Iterator[None]:
     """Create the folder of a sweep or continue an existing one, with exclusive access.
 
     Args:
@@ -630,13 +630,13 @@ def run_sweep(
         InputError: a point is invalid, the folder contains another sweep, or the cluster failed.
         KeyboardInterrupt: on Ctrl-C; finished runs are kept.
     """
-    sweep_settings, base = sweep_settings or SweepSettings(), open_base(file)
+    sweep_settings, base = sweep_settings or SweepSettings(), read_base_scenario(file)
     checked = check_points(base, progress and (lambda done, total: progress("check", done, total, 0)))
     possible = possible_number_names(checked.axes, checked.teleoperated)
     check_figures(file.sweep.figures, possible, file.format_location("figures"))
     if sweep_settings.dask:
         base.machine_copies.check_sendable("--dask")
-    with sweep_folder(target, base, checked, sweep_settings.fresh):
+    with open_sweep_folder(target, base, checked, sweep_settings.fresh):
         with closing(Journal(target / JOURNAL)) as journal:
             missing = _find_missing_runs(base, journal, sweep_settings.retry_failed)
             _execute_runs(base, target, journal, missing, sweep_settings, checked, progress)
@@ -699,8 +699,8 @@ def _execute_runs(
 
 
 def _make_task(base: SweepBase, target: Path, how: SweepSettings, checked: CheckedSweep, point: Point) -> RunTask:
-    scenario = scenario_of(base, point)
-    if fingerprint(scenario) != checked.fingerprints[point.run - 1]:
+    scenario = make_point_scenario(base, point)
+    if hash_scenario(scenario) != checked.fingerprints[point.run - 1]:
         message = "one of its files changed during the sweep; the finished runs are kept"
         raise InputError(base.scenario.path, message)
     keep = how.write_run_files if base.file.sweep.logs else None
@@ -730,7 +730,7 @@ def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outc
             (folder / file).write_bytes(content)
         # the scenario written by a worker contains machine paths of that computer
         save_scenario(
-            with_resolved_paths(scenario_of(base, point), resolve_path(target)),
+            with_resolved_paths(make_point_scenario(base, point), resolve_path(target)),
             folder / "scenario.yaml",
         )
 

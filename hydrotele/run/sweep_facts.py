@@ -23,7 +23,7 @@ from hydrotele.core.datafile import Name, Number, StrictModel, read_yaml, sugges
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.machine.machine import Machine, get_sensors
+from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.sweep_runs import MachineCopies
 from hydrotele.scenario.scenario import (
@@ -40,7 +40,7 @@ MAX_RUNS = 100_000
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "choice")
 
 
-def _check_value(value: Any) -> Any:
+def _check_serialisable(value: Any) -> Any:
     """Return a value after checking that it can be written to a scenario.
 
     Raises:
@@ -53,7 +53,7 @@ def _check_value(value: Any) -> Any:
     return value
 
 
-def _check_values(values: list[Any]) -> list[Any]:
+def _check_grid_values(values: list[Any]) -> list[Any]:
     """Return the values of a grid after checking them.
 
     Raises:
@@ -61,15 +61,15 @@ def _check_values(values: list[Any]) -> list[Any]:
     """
     seen = set()
     for value in values:
-        text = json.dumps(_check_value(value))
+        text = json.dumps(_check_serialisable(value))
         if text in seen:
             raise ValueError(f"{text} occurs twice; use repeat for several runs of one value")
         seen.add(text)
     return values
 
 
-Value = Annotated[Any, AfterValidator(_check_value)]
-Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_check_values)]
+Value = Annotated[Any, AfterValidator(_check_serialisable)]
+Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_check_grid_values)]
 
 
 class Distribution(StrictModel):
@@ -283,17 +283,17 @@ def draw_samples(sweep: Sweep) -> list[dict[str, Any]]:
     ]
 
 
-def _draw_value(seed: int, k: int, key: str, where: Distribution) -> Any:
+def _draw_value(seed: int, k: int, key: str, distribution: Distribution) -> Any:
     chance = np.random.default_rng([seed, k, zlib.crc32(key.encode())])
-    if where.choice is not None:
-        return where.choice[int(chance.integers(len(where.choice)))]
-    if where.normal is not None:
-        return float(chance.normal(*where.normal))
-    if where.log_uniform is not None:
-        low, high = map(math.log, where.log_uniform)
+    if distribution.choice is not None:
+        return distribution.choice[int(chance.integers(len(distribution.choice)))]
+    if distribution.normal is not None:
+        return float(chance.normal(*distribution.normal))
+    if distribution.log_uniform is not None:
+        low, high = map(math.log, distribution.log_uniform)
         return math.exp(chance.uniform(low, high))
-    assert where.uniform is not None
-    return float(chance.uniform(*where.uniform))
+    assert distribution.uniform is not None
+    return float(chance.uniform(*distribution.uniform))
 
 
 def override_text(value: Any) -> str:
@@ -352,7 +352,7 @@ class CheckedSweep(NamedTuple):
         return hashlib.sha256(b"".join(self.fingerprints)).hexdigest()
 
 
-def open_base(file: SweepFile) -> SweepBase:
+def read_base_scenario(file: SweepFile) -> SweepBase:
     """Read the base scenario of a sweep.
 
     Raises:
@@ -361,7 +361,7 @@ def open_base(file: SweepFile) -> SweepBase:
     return SweepBase(file, read_scenario_file(file.find_scenario()), MachineCopies())
 
 
-def scenario_of(base: SweepBase, point: Point) -> Scenario:
+def make_point_scenario(base: SweepBase, point: Point) -> Scenario:
     """Return the scenario of one run of a sweep.
 
     It refers to the copies of user machines in the sweep folder.
@@ -370,10 +370,10 @@ def scenario_of(base: SweepBase, point: Point) -> Scenario:
         InputError: the scenario is invalid.
     """
     scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, point.values))
-    return _repeat_scenario(base, scenario, point.repetition_number)
+    return _make_repetition(base, scenario, point.repetition_number)
 
 
-def _repeat_scenario(base: SweepBase, scenario: Scenario, repetition_number: int) -> Scenario:
+def _make_repetition(base: SweepBase, scenario: Scenario, repetition_number: int) -> Scenario:
     """Return a copy of a scenario whose seed is increased by the number of the repetition.
 
     It refers to the copies of user machines in the sweep folder.
@@ -382,10 +382,10 @@ def _repeat_scenario(base: SweepBase, scenario: Scenario, repetition_number: int
     return base.machine_copies.with_copied_paths(scenario.model_copy(update={"seed": seed}))
 
 
-def fingerprint(scenario: Scenario) -> bytes:
+def hash_scenario(scenario: Scenario) -> bytes:
     """Return a 16-byte hash of a scenario, which shows whether its content has changed.
 
-    For a result of `scenario_of`, the folder of the scenario's files does not matter.
+    For a result of `make_point_scenario`, the folder of the scenario's files does not matter.
     """
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 
@@ -394,7 +394,7 @@ def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSw
     """Check the scenarios of all runs of a sweep, with machine, effects and sensors.
 
     Args:
-        base: result of `open_base`.
+        base: result of `read_base_scenario`.
         progress: called periodically with (points checked, number of points).
 
     Raises:
@@ -413,11 +413,11 @@ def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSw
                 scenario = _check_values_of_point(base, point.values, machines)
                 teleoperated |= scenario.pilot.kind == "teleop"
                 units |= _effect_units(scenario, sweep.varied_keys, machines)
-            whole = _repeat_scenario(base, scenario, point.repetition_number)
+            whole = _make_repetition(base, scenario, point.repetition_number)
         except InputError as error:
             raise _locate_error(base, point, machines, error) from None
         seed = seed if prints else whole.seed
-        prints.append(fingerprint(whole))
+        prints.append(hash_scenario(whole))
         if progress and point.run % 100 == 0:
             progress(point.run, sweep.runs)
     axes = dict.fromkeys(axis for machine in machines.values() for axis in machine.axes)
@@ -437,7 +437,7 @@ def _check_values_of_point(base: SweepBase, values: dict[str, Any], machines: _M
     """
     scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, values))
     machine = _machine_of(scenario, machines)
-    get_sensors(machine, scenario.sensors)
+    get_sensor_set(machine, scenario.sensors)
     for planted in scenario.effects:
         machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
     return scenario

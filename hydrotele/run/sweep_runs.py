@@ -24,7 +24,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import parse_json, resolve_path
 from hydrotele.core.output import atomic_file
 from hydrotele.core.units import KEY_SUFFIXES
-from hydrotele.machine.machine_file import machine_path, shipped_machines
+from hydrotele.machine.machine_file import find_machine_file, shipped_machines
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import Scenario, find_local_machine
 from hydrotele.simulate.native import stop_profiling_clock
@@ -64,16 +64,16 @@ def flatten_summary(summary: dict[str, Any]) -> Numbers:
     {'tracking.boom.rms': (0.1, 'rad')}
     """
     kept = {key: value for key, value in summary.items() if key not in _IGNORED_KEYS}
-    return dict(_flatten(kept, "", None))
+    return dict(_iterate_summary_numbers(kept, "", None))
 
 
-def _flatten(part: dict[str, Any], above: str, unit: str | None):
+def _iterate_summary_numbers(part: dict[str, Any], above: str, unit: str | None):
     unit = part.get("unit", unit)
     for key, value in part.items():
         name = f"{above}{key}"
         value = value.item() if isinstance(value, np.generic) else value  # JSON needs plain types
         if isinstance(value, dict):
-            yield from _flatten(value, f"{name}.", unit)
+            yield from _iterate_summary_numbers(value, f"{name}.", unit)
         elif value is None or isinstance(value, (bool, int, float)):
             finite = value if value is None or math.isfinite(value) else None
             yield name, (finite, unit or _UNIT_OF_SUFFIX.get(key.rpartition("_")[2], "1"))
@@ -255,7 +255,7 @@ class MachineCopies:
                 raise InputError(where, f"machine {path} {message}")
 
     def _copied_machine(self, path: Path) -> CopiedMachine:
-        file = resolve_path(machine_path(path))
+        file = resolve_path(find_machine_file(path))
         if file not in self._known:
             self._known[file] = _copy_machine(file)
         return self._known[file]

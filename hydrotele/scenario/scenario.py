@@ -186,7 +186,7 @@ def _find_nonrising_steps(values) -> list[bool]:
     return [b <= a for a, b in zip(values, values[1:], strict=False)]
 
 
-def _check_capacity(name: str, amount: float) -> None:
+def _check_size_limit(name: str, amount: float) -> None:
     if said := describe_excess(name, amount):
         raise ValueError(f"has {said}")
 
@@ -222,7 +222,7 @@ class FourierPilot(StrictModel):
         if both := sorted(set(self.closed_valves) & self.axes.keys()):
             raise ValueError(f"closed_valves: {both[0]} also has a reference in axes; name it in one of them")
         counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
-        _check_capacity("HARMONICS", max(counts, default=0))
+        _check_size_limit("HARMONICS", max(counts, default=0))
         return self
 
 
@@ -257,7 +257,7 @@ class LinesPilot(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        _check_capacity("MOVES", len(self.moves))
+        _check_size_limit("MOVES", len(self.moves))
         return self
 
 
@@ -285,7 +285,7 @@ class WaypointsPilot(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        _check_capacity("MOVES", len(self.points))
+        _check_size_limit("MOVES", len(self.points))
         return self
 
 
@@ -368,8 +368,8 @@ class Scenario(StrictModel):
         ticks = self.control_rate / self.log_rate
         if ticks < 0.999 or abs(ticks - round(ticks)) > 1e-6:
             raise ValueError(f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz")
-        _check_capacity("RUN_TICKS", self.duration * self.control_rate)
-        _check_capacity("RUN_ROWS", self.duration * self.log_rate)
+        _check_size_limit("RUN_TICKS", self.duration * self.control_rate)
+        _check_size_limit("RUN_ROWS", self.duration * self.log_rate)
         if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
             raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
         if sum(thing.kind == "soil" for thing in self.surroundings) > (1 if self.ground else 0):
@@ -475,7 +475,7 @@ def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -
         lines = lines | {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
     source = f"{path} with --set {' '.join(overrides)}" if overrides else str(path)
     scenario = validate_data(Scenario, data, source, {} if overrides else lines)
-    return _load_table(scenario, _locate_key(path, lines, "pilot", "file"))
+    return _load_pilot_table(scenario, _locate_key(path, lines, "pilot", "file"))
 
 
 def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
@@ -483,7 +483,7 @@ def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
     return f"{path}{line}: {'.'.join(keys)}"
 
 
-def _load_table(scenario: Scenario, where: str) -> Scenario:
+def _load_pilot_table(scenario: Scenario, where: str) -> Scenario:
     """Replace the log file of a table pilot by its columns, so that the scenario is self-contained.
 
     `where` names file, line and key in error messages. Raise InputError for an unsuitable log.
@@ -551,7 +551,7 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
         raise InputError(f"--set {key}", "there is nothing to set at this key")
 
 
-def logged_soil(log: Log) -> tuple[SoilGround, ...]:
+def read_soil_from_log(log: Log) -> tuple[SoilGround, ...]:
     """Read from a log's metadata the soil that the bucket could dig during the run.
 
     The result has one element, or is empty if the run had no soil.

@@ -135,7 +135,7 @@ class ButtonCommand(StrictModel):
     command: float
 
 
-def _check_time(time: list[float]) -> None:
+def _check_time_points(time: list[float]) -> None:
     rises = all(a < b for a, b in zip(time, time[1:], strict=False))
     if not time or time[0] != 0.0 or not rises:
         raise ValueError("time must start at 0 and rise strictly")
@@ -154,7 +154,7 @@ class FollowPath(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        _check_time(self.time)
+        _check_time_points(self.time)
         for name, values in self.path.items():
             if len(values) != len(self.time):
                 raise ValueError(f"path.{name} has {len(values)} values, time has {len(self.time)}")
@@ -173,7 +173,7 @@ class ForceTarget(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        _check_time(self.time)
+        _check_time_points(self.time)
         if len(self.time) != len(self.force):
             raise ValueError(f"force has {len(self.force)} values, time has {len(self.time)}")
         return self
@@ -220,7 +220,7 @@ class SteerToPoses(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        _check_time(self.time)
+        _check_time_points(self.time)
         for name, values in self.points.items():
             if len(values) != len(self.time):
                 raise ValueError(f"points.{name} has {len(values)} values, time has {len(self.time)}")
@@ -311,7 +311,7 @@ class OperatorSettings(StrictModel):
     correction_interval: PositiveFloat | None = None
 
 
-def _get_kind(value: object) -> object:
+def _get_operator_kind(value: object) -> object:
     """Return the key `kind` of an operator's data, which selects the class that validates it.
 
     The kind is `recorded` if it is omitted and the key `recorded` is given, and otherwise None.
@@ -328,7 +328,7 @@ OperatorBehaviour = Annotated[
     | Annotated[LiveOperator, Tag("live")]
     | Annotated[RecordedMotion, Tag("recorded")],
     Discriminator(
-        _get_kind,
+        _get_operator_kind,
         custom_error_type="operator_kind",
         custom_error_message="needs kind: follow, regulate, track, steer, live; or recorded: FILE",
     ),

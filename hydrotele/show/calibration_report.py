@@ -14,7 +14,7 @@ from hydrotele.calibrate.design import ARM_LENGTHS, FOREARM_LENGTHS, Design, Des
 from hydrotele.calibrate.linkage import PARAMETER_NAMES, LinkageFit, linkage_parameters
 from hydrotele.calibrate.loop import unit_of
 from hydrotele.calibrate.mukca import HeldOutPrediction, SocketCalibration
-from hydrotele.show.report_html import Section, png, report_figure, write_sections
+from hydrotele.show.report_html import Section, figure_to_png, open_report_figure, write_sections
 
 _MAX_TIP_ERROR = 0.06  # m, upper limit of the colour scale of the designs
 
@@ -65,7 +65,7 @@ def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
     Each pose has two loop-closure equations, for distance and height; their residuals are divided by
     the standard deviation due to sensor noise.
     """
-    with report_figure(0.4 + 1.5 * len(stages)) as figure:
+    with open_report_figure(0.4 + 1.5 * len(stages)) as figure:
         places = figure.subplots(len(stages), 1, squeeze=False)[:, 0]
         for place, poses in zip(places, stages, strict=True):
             rows = stage_residuals(fit.nominal, poses, fit.parameters)
@@ -74,7 +74,7 @@ def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
             place.set_title(f"residual / sensor noise [1], moving link {poses.link}")
             place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         places[-1].set_xlabel("pose")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
@@ -96,7 +96,7 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
                 f" accounted for (VAF) {found.vaf:.3f} % (higher is better) on held-out samples;"
                 f" {found.angle_source} joint angles.")  # fmt: skip
         sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "95 % +-"),
-                                rows, picture=draw_linkage(found)))  # fmt: skip
+                                rows, picture=draw_linkage_errors(found)))  # fmt: skip
     write_sections(
         path, f"hydrotele {hydrotele.__version__} - calibrate linkage", "Cylinder linkages",
         "Calibration of the pin triangle of each cylinder (Khoshzaban 1992, Eq. 3.26), validated on"
@@ -104,14 +104,14 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
     )  # fmt: skip
 
 
-def draw_linkage(fit: LinkageFit) -> bytes:
+def draw_linkage_errors(fit: LinkageFit) -> bytes:
     """Draw the error of the piston displacement [mm] of a fitted linkage over the joint angle as PNG."""
-    with report_figure(2.4) as figure:
+    with open_report_figure(2.4) as figure:
         place = figure.subplots()
         place.plot(np.degrees(fit.angle), 1e3 * fit.residual, ".", ms=2, color="#1769aa")
         place.set_title(f"{fit.axis}: error of the piston displacement [mm]")
         place.set_xlabel("joint angle [deg]")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
@@ -131,7 +131,7 @@ def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
         ("information on the parameters,\nlog10 of the determinant [1]", told, "viridis", "%.0f"),
         ("poses reached by the\ncalibrator [%]", 100.0 * reached, "viridis", "%.0f"),
     )  # fmt: skip
-    with report_figure(4.0) as figure:
+    with open_report_figure(4.0) as figure:
         for place, (title, values, colours, form) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
             shown = place.contourf(ARM_LENGTHS, FOREARM_LENGTHS, values, 12, cmap=colours)
             figure.colorbar(shown, ax=place, format=form, shrink=0.7)
@@ -143,7 +143,7 @@ def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
             place.set_aspect("equal")
         figure.axes[0].set_ylabel("forearm [m]")
         figure.axes[0].legend(loc="lower left", fontsize=8)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 _NOMINAL_COLOUR, _CALIBRATED_COLOUR, _MARK_COLOUR = "#b9bfc7", "#1769aa", "#e07b00"
@@ -164,7 +164,7 @@ def draw_pose_errors(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], descri
     Returns:
         A PNG.
     """
-    with report_figure(0.3 + 1.9 * len(errors)) as figure:
+    with open_report_figure(0.3 + 1.9 * len(errors)) as figure:
         axes = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
         for place, (title, (before, after)) in zip(axes, errors.items(), strict=True):
             at = np.arange(1, len(before) + 1)
@@ -175,7 +175,7 @@ def draw_pose_errors(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], descri
             place.margins(x=0.01)
             place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         axes[-1].set_xlabel("pose")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_posterior(
@@ -196,7 +196,7 @@ def draw_posterior(
     """
     p = len(names)
     thin = sample[:: max(1, len(sample) // _MAX_SCATTER_POINTS)]
-    with report_figure(1.5 * p) as figure:
+    with open_report_figure(1.5 * p) as figure:
         axes = figure.subplots(p, p, squeeze=False, sharex="col")
         for row in range(p):
             for column in range(p):
@@ -232,7 +232,7 @@ def draw_posterior(
                     place.set_yticklabels([])
         label = f"{unit}; lines: {mark_label}" if mark is not None else unit
         figure.suptitle(f"Posterior [{label}]; numbers: correlation", fontsize=9)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def _draw_contours(place, x: np.ndarray, y: np.ndarray) -> None:
@@ -248,7 +248,7 @@ def _draw_contours(place, x: np.ndarray, y: np.ndarray) -> None:
 NOMINAL_POINTS_COLOUR, CALIBRATED_POINTS_COLOUR = "#e07b00", "#1769aa"
 
 
-def draw_sockets(calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction]) -> bytes:
+def draw_socket_errors(calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction]) -> bytes:
     """Draw errors of a robot calibration with ball and sockets, before and after.
 
     The upper plot shows the distance of the predicted ball from its mean position in the socket, the
@@ -273,7 +273,7 @@ def draw_sockets(calibration: SocketCalibration, heldout_parts: Sequence[HeldOut
             calibration.calibrated_errors.socket_distances,
         )
     names = list(after)
-    with report_figure(6.4) as figure:
+    with open_report_figure(6.4) as figure:
         upper, lower = figure.subplots(2, 1, height_ratios=(1.7, 1.0))
         place = 0
         for k, name in enumerate(names):
@@ -310,7 +310,7 @@ def draw_sockets(calibration: SocketCalibration, heldout_parts: Sequence[HeldOut
         upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
                      fontsize=8.5, borderaxespad=0.1, markerscale=2.0)  # fmt: skip
         _draw_distances(lower, apart, calibration.options.distance)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def _draw_distances(plot: Any, distances: dict[str, float], given_distance: float | None) -> None:
@@ -340,7 +340,7 @@ def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> 
     Args:
         path: HTML file to write.
         document: content of `calibration.json`.
-        picture: PNG of `draw_sockets`.
+        picture: PNG of `draw_socket_errors`.
     """
     judged, fitted = document["heldout"], document["fitted"]
     figures = [

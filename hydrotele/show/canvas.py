@@ -43,22 +43,22 @@ class Marker(NamedTuple):
     emission: float = _MARKER_EMISSION
 
 
-def ball(middle, radius: float, colour) -> Marker:
+def make_ball_marker(middle, radius: float, colour) -> Marker:
     """Create a sphere to add to a rendered scene, with centre (3,) and radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_SPHERE, np.array(middle), None, np.full(3, radius), colour)
 
 
-def line(start, end, radius: float, colour) -> Marker:
+def make_line_marker(start, end, radius: float, colour) -> Marker:
     """Create a line to add to a rendered scene, between points (3,) [m], with radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_CAPSULE, np.array(start), np.array(end), np.array([radius]), colour)
 
 
-def arrow(start, end, radius: float, colour) -> Marker:
+def make_arrow_marker(start, end, radius: float, colour) -> Marker:
     """Create an arrow to add to a rendered scene, between points (3,) [m], with radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_ARROW, np.array(start), np.array(end), np.array([radius]), colour)
 
 
-def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marker:
+def make_box_marker(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marker:
     """Create a box to add to a rendered scene.
 
     Args:
@@ -71,12 +71,12 @@ def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marke
     return Marker(_Geom.mjGEOM_BOX, np.array(middle), None, np.array(half_sizes), colour, turn.ravel())
 
 
-def polyline(points, radius: float, colour) -> list[Marker]:
+def make_polyline_markers(points, radius: float, colour) -> list[Marker]:
     """Create lines to add to a rendered scene that connect consecutive points (n, 3) [m]."""
-    return [line(a, b, radius, colour) for a, b in zip(points[:-1], points[1:], strict=True)]
+    return [make_line_marker(a, b, radius, colour) for a, b in zip(points[:-1], points[1:], strict=True)]
 
 
-def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
+def add_markers_to_scene(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
     """Add shapes to a MuJoCo scene as decoration; those beyond its capacity are omitted.
 
     Args:
@@ -130,7 +130,7 @@ class Canvas:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         # A shadow map needs no more pixels than the image.
         model.vis.quality.shadowsize = min(_MAX_SHADOW_SIZE, 1 << (max(width, height) - 1).bit_length())
-        self._gl, self._context = _open(model, width, height)
+        self._gl, self._context = _open_render_context(model, width, height)
         self._scene = mujoco.MjvScene(model, model.ngeom + _MAX_MARKERS)
         self._option, self._rectangle = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
         self._upright = np.empty((height, width, 3), np.uint8)
@@ -154,7 +154,7 @@ class Canvas:
             raise RuntimeError("the canvas is closed")
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, camera, everything, self._scene)
-        write_markers(self._scene, markers)
+        add_markers_to_scene(self._scene, markers)
         self._gl.make_current()
         try:
             mujoco.mjr_render(self._rectangle, self._scene, self._context)
@@ -184,7 +184,7 @@ def has_screen() -> bool:
     return seen or not sys.platform.startswith("linux")
 
 
-def _open(model: mujoco.MjModel, width: int, height: int):
+def _open_render_context(model: mujoco.MjModel, width: int, height: int):
     """Open an off-screen OpenGL context with the first driver that works.
 
     Args:
@@ -199,7 +199,7 @@ def _open(model: mujoco.MjModel, width: int, height: int):
         InputError: no driver works; the message names the packages to install.
     """
     reasons = []
-    for name in _candidate_drivers():
+    for name in _list_opengl_drivers():
         gl = None
         try:
             with warnings.catch_warnings():
@@ -232,7 +232,7 @@ def _release_context(gl: Any) -> None:
         glfw.make_context_current(None)
 
 
-def _candidate_drivers() -> tuple[str, ...]:
+def _list_opengl_drivers() -> tuple[str, ...]:
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted in _OFFSCREEN:
         return (wanted,)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.units import axis_unit
+from hydrotele.core.units import plot_axis_unit
 from hydrotele.logs.log import Log
 from hydrotele.machine.signals import Channel, parse_channel
 
@@ -90,7 +90,7 @@ class Trace(NamedTuple):
         return self.channel.axis or "supply"
 
 
-def scaled_channel(log: Log, name: str) -> Trace:
+def scale_channel_for_plot(log: Log, name: str) -> Trace:
     """Return a channel of a log, converted from SI to the unit of its plot, such as deg or mm.
 
     Raises:
@@ -99,7 +99,7 @@ def scaled_channel(log: Log, name: str) -> Trace:
     channel, values = parse_channel(name), log[name]
     if channel.kind in _UNSCALED_KINDS and log.units[name] != "rad":
         return Trace(channel, log.units[name], values)
-    unit, factor = axis_unit(log.units[name])
+    unit, factor = plot_axis_unit(log.units[name])
     return Trace(channel, unit, values * factor)
 
 
@@ -120,7 +120,7 @@ def group_channels(names: Iterable[str]) -> dict[str, list[str]]:
     return {kind: members for kind, members in groups.items() if members}
 
 
-def colours(logs: Sequence[Log]) -> dict[str, tuple[int, int, int]]:
+def assign_axis_colours(logs: Sequence[Log]) -> dict[str, tuple[int, int, int]]:
     """Assign a plot colour to each axis in the logs: {axis: sRGB 0 .. 255}.
 
     The key "" is for channels without an axis. The measured axes come first, so that their colours
@@ -138,7 +138,7 @@ def common_channels(first: Log, other: Log) -> list[str]:
     return [name for name, unit in first.units.items() if other.units.get(name) == unit]
 
 
-def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
+def compute_channel_difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
     """Subtract a channel of two logs, `first - other`, at the times of the first log.
 
     The other log is interpolated linearly. Only the time interval common to both logs is used.
@@ -157,7 +157,7 @@ def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
             f" {first.time[0]:.3f} to {first.time[-1]:.3f} s: shift one of them to a common clock",
         )
     time = first.time[inside]
-    ours, theirs = scaled_channel(first, name), scaled_channel(other, name)
+    ours, theirs = scale_channel_for_plot(first, name), scale_channel_for_plot(other, name)
     values = ours.values[inside] - np.interp(time, other.time, theirs.values)
     return time, ours._replace(values=values)
 

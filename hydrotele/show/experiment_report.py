@@ -13,7 +13,7 @@ import hydrotele
 from hydrotele.experiments.comparison import Comparison, Panel, summarize_verdicts
 from hydrotele.show import report_html
 from hydrotele.show.calibration_report import draw_posterior
-from hydrotele.show.report_html import png, report_figure, svg
+from hydrotele.show.report_html import figure_to_png, open_report_figure, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,13 +47,15 @@ class ReportFigure(NamedTuple):
     svg: bytes | None
 
 
-def write_experiment_report(title: str, rows: Sequence[Comparison], drawings: Mapping[str, str], folder: Path) -> None:
+def write_experiment_report(
+    title: str, rows: Sequence[Comparison], items_without_result: Mapping[str, str], folder: Path
+) -> None:
     """Write `report.html`, and `figures/` with an SVG and a PNG per figure and `captions.md`.
 
     Args:
         title: title of the publication.
         rows: comparisons of published and simulated results.
-        drawings: {table or figure of the publication: reason why it has no result to compare}.
+        items_without_result: {table or figure of the publication: reason why it has no result to compare}.
         folder: existing output folder.
     """
     figures = draw_figures(rows)
@@ -66,12 +68,12 @@ def write_experiment_report(title: str, rows: Sequence[Comparison], drawings: Ma
     if figures:
         captions = [f"- `{one.stem}`: {one.caption}" for one in figures]
         (folder / "figures" / "captions.md").write_text("\n".join(captions) + "\n", "utf-8")
-    report_html.write_report(
+    report_html.write_template_report(
         "experiments", folder / "report.html", title=f"Experiments of {title}",
         version=hydrotele.__version__, document=title, summary=summarize_verdicts(rows),
         counted=[row for row in rows if row.kind != "input"],
         inputs=[row for row in rows if row.kind == "input"],
-        drawings=list(drawings.items()), figures=figures,
+        drawings=list(items_without_result.items()), figures=figures,
     )  # fmt: skip
 
 
@@ -116,7 +118,7 @@ def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
     """
     rows = [(panel, error) for panel in panels for error in (False, True)
             if not error or panel.errors]  # fmt: skip
-    with report_figure(0.5 + _PANEL_HEIGHT * len(rows)) as figure:
+    with open_report_figure(0.5 + _PANEL_HEIGHT * len(rows)) as figure:
         shared = len({panel.x_label for panel in panels}) == 1
         axes = figure.subplots(len(rows), 1, sharex=shared, squeeze=False)[:, 0]
         for (panel, error), place in zip(rows, axes, strict=True):
@@ -125,7 +127,7 @@ def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
                 place.set_xlabel(panel.x_label)
         axes[-1].set_xlabel(panels[-1].x_label)
         figure.align_ylabels(list(axes))
-        return png(figure), svg(figure)
+        return figure_to_png(figure), svg(figure)
 
 
 def _draw_curves(place: "Axes", panel: Panel, draws_errors: bool) -> None:

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.core.units import axis_unit
+from hydrotele.core.units import plot_axis_unit
 from hydrotele.gap.description import channel_words, headline, learned_title, verdict_words
 from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import default_unit, parse_channel
+from hydrotele.machine.signals import default_channel_unit, parse_channel
 from hydrotele.show.channels import padded_range
 from hydrotele.show.recording import (
     Scene,
@@ -104,7 +104,7 @@ def channel_rms(prediction: Prediction) -> np.ndarray:
         return np.sqrt(total / present.sum(axis=0))
 
 
-def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
+def find_gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
     """Find the time intervals in which the prediction error of a channel is significant.
 
     The limit is a quantile of the chi-square distribution: a perfect model, whose errors have the
@@ -140,7 +140,7 @@ def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
     return stretches
 
 
-def most_changed_channels(before: Prediction, after: Prediction, count: int) -> list[str]:
+def find_most_improved_channels(before: Prediction, after: Prediction, count: int) -> list[str]:
     """Return the channels whose mean square prediction error decreases most from one model to another.
 
     If both predictions are equal, the channels with the largest mean square error are returned.
@@ -197,7 +197,7 @@ def gap_blueprint(
     for axis in axes:
         mine = [c for c in before.channels if parse_channel(c).axis == axis]
         views = [_channel_view(before, models, c, legend=c == mine[0]) for c in mine]
-        command = [_command(axis)] if axis else []
+        command = [_make_command_view(axis)] if axis else []
         tabs.append(rrb.Vertical(*command, *views, name=axis or "supply"))
     errors = [_error_view(models, channel) for channel in before.channels]
     tabs.append(rrb.Grid(*errors, grid_columns=2, name="Residuals"))
@@ -214,16 +214,16 @@ def gap_blueprint(
 def _rms_view(models) -> "rrb.TimeSeriesView":
     paths = [f"/gap/{name}" for name in models]
     title = "RMS prediction error [x noise]; red: gap windows"
-    return _view(title, [*paths, "/gap/perfect", "/gap/window"], None, legend=True)
+    return _make_time_series_view(title, [*paths, "/gap/perfect", "/gap/window"], None, legend=True)
 
 
 def _channel_view(before: Prediction, models, channel: str, legend: bool) -> "rrb.TimeSeriesView":
-    unit, factor = axis_unit(default_unit(channel))
+    unit, factor = plot_axis_unit(default_channel_unit(channel))
     column = before.channels.index(channel)
     values = [before.measured[:, column], *(p.predicted[:, column] for p, _ in models.values())]
     span = padded_range([factor * v[np.isfinite(v)] for v in values], unit)
     paths = [entity_path(name, channel) for name in ("measured", *models)]
-    return _view(f"{channel_words(channel)} [{unit}]", paths, span, legend)
+    return _make_time_series_view(f"{channel_words(channel)} [{unit}]", paths, span, legend)
 
 
 def _error_view(models, channel: str) -> "rrb.TimeSeriesView":
@@ -233,14 +233,16 @@ def _error_view(models, channel: str) -> "rrb.TimeSeriesView":
     span = 1.05 * max(_MIN_ERROR_RANGE, float(largest))
     paths = [entity_path(f"residual/{name}", channel) for name in models]
     title = f"{channel_words(channel)}, error [x noise]"
-    return _view(title, paths, (-span, span), legend=False)
+    return _make_time_series_view(title, paths, (-span, span), legend=False)
 
 
-def _command(axis: str) -> "rrb.TimeSeriesView":
-    return _view(f"{axis} command", [f"/command/{axis}"], None, legend=False)
+def _make_command_view(axis: str) -> "rrb.TimeSeriesView":
+    return _make_time_series_view(f"{axis} command", [f"/command/{axis}"], None, legend=False)
 
 
-def _view(title: str, paths: Sequence[str], span: tuple[float, float] | None, legend: bool) -> "rrb.TimeSeriesView":
+def _make_time_series_view(
+    title: str, paths: Sequence[str], span: tuple[float, float] | None, legend: bool
+) -> "rrb.TimeSeriesView":
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -275,7 +277,7 @@ def write_gap_recording(path: str | os.PathLike, gap: Gap, run: RunData, axes: S
     models = {"nominal": (before, _NOMINAL_COLOUR)}
     if has_patch(gap):
         models["patched"] = (after, _PATCHED_COLOUR)
-    windows = gap_windows(before, gap.size.noise_floor or gap.size.before)
+    windows = find_gap_windows(before, gap.size.noise_floor or gap.size.before)
     identity = f"hydrotele gap {gap.machine.name} {gap.machine.tool}"
     with open_recording(path, identity) as out:
         out.send_recording_name(f"{gap.machine.name} {before.run}: {headline(gap)}")
@@ -285,7 +287,7 @@ def write_gap_recording(path: str | os.PathLike, gap: Gap, run: RunData, axes: S
         _log_rms(out, models, gap.size.noise_floor)
         _log_windows(out, gap, windows, before)
         out.log("about", _verdict_document(gap), static=True)
-        worst = most_changed_channels(before, after, 2)
+        worst = find_most_improved_channels(before, after, 2)
         out.send_blueprint(gap_blueprint(scene, before, models, worst))
 
 
@@ -297,7 +299,7 @@ def _interpolated_log(prediction: Prediction, run: RunData) -> Log:
         known = np.isfinite(values)
         if known.any():
             columns[channel] = np.interp(prediction.time, prediction.time[known], values[known])
-    units = {channel: default_unit(channel) for channel in columns}
+    units = {channel: default_channel_unit(channel) for channel in columns}
     return Log(prediction.time, columns, units, run.log.metadata, run.log.source)
 
 
@@ -321,16 +323,16 @@ def _log_channels(out, models) -> None:
     """
     before, _ = models["nominal"]
     for k, channel in enumerate(before.channels):
-        unit, factor = axis_unit(default_unit(channel))
+        unit, factor = plot_axis_unit(default_channel_unit(channel))
         lines = {"measured": (before.measured[:, k], _MEASURED_COLOUR)}
         for name, (prediction, colour) in models.items():
             lines[name] = (prediction.predicted[:, k], colour)
             error = prediction.whitened[:, k]
             path = entity_path(f"residual/{name}", channel)
-            _send(out, path, prediction.time, error, _style(colour, f"{name} [x noise]", 1.2))
+            _log_time_series(out, path, prediction.time, error, _style(colour, f"{name} [x noise]", 1.2))
         for name, (values, colour) in lines.items():
             style = _style(colour, f"{name} [{unit}]", _WIDTHS[name])
-            _send(out, entity_path(name, channel), before.time, factor * values, style)
+            _log_time_series(out, entity_path(name, channel), before.time, factor * values, style)
 
 
 def _log_rms(out, models, floor: float | None) -> None:
@@ -346,11 +348,11 @@ def _log_rms(out, models, floor: float | None) -> None:
         total = np.nansum(found.rms**2 * found.count, axis=1)
         size = np.sqrt(total / np.maximum(found.count.sum(axis=1), 1))
         middle = 0.5 * (found.edges[:-1] + found.edges[1:])
-        _send(out, f"/gap/{name}", middle, size, _style(colour, f"{name} [x noise]", 2.0))
+        _log_time_series(out, f"/gap/{name}", middle, size, _style(colour, f"{name} [x noise]", 2.0))
     if floor is None:
         return
     ends = models["nominal"][0].time[[0, -1]]
-    _send(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR_COLOUR, "perfect model", 1.2))
+    _log_time_series(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR_COLOUR, "perfect model", 1.2))
 
 
 def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
@@ -381,7 +383,7 @@ def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction
     out.send_columns("/gap/text", [time_column(np.array(times))], columns)
 
 
-def _send(out, path: str, time: np.ndarray, values: np.ndarray, style) -> None:
+def _log_time_series(out, path: str, time: np.ndarray, values: np.ndarray, style) -> None:
     import rerun as rr
 
     known = np.isfinite(values)

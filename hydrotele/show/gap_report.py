@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.core.units import axis_unit, display_unit
+from hydrotele.core.units import display_unit, plot_axis_unit
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.description import (
     channel_words,
@@ -43,11 +43,16 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
-from hydrotele.show.gap_recording import channel_rms, most_changed_channels, windowed_errors
-from hydrotele.show.report_html import png, report_figure, scale_dumbbell, scale_interval
+from hydrotele.show.gap_recording import channel_rms, find_most_improved_channels, windowed_errors
+from hydrotele.show.report_html import (
+    figure_to_png,
+    open_report_figure,
+    scale_dumbbell_to_pixels,
+    scale_interval_to_pixels,
+)
 
 _MAX_RANKED_EFFECTS = 12
 _MAX_COLOUR_RATIO = 10.0  # times sensor noise at which the colour of a cell is darkest
@@ -74,18 +79,18 @@ def write_report(gap: Gap, path: str | Path) -> None:
     over += f", tool {gap.machine.tool}" if gap.machine.tool else ""
     if gap.before:
         over += f"  ·  held-out run {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
-    report_html.write_report(
+    report_html.write_template_report(
         "gap", path, title=f"{gap.machine.name}: {headline(gap)}", over=over, heading=headline(gap),
-        chip=(gap.verdict, _VERDICT_LABELS[gap.verdict]), figures=_figures(gap), verdict=verdict_words(gap),
+        chip=(gap.verdict, _VERDICT_LABELS[gap.verdict]), figures=_key_figure_cards(gap), verdict=verdict_words(gap),
         found=_effect_rows(gap), calibrated=_calibration_rows(gap), learned=[*map(_law_content, gap.learned)],
         unknown=_unknown_content(gap), lacks=_residual_input_rows(gap), patched=patched,
         run=gap.before[0].run if gap.before else "", proof=_validation_content(gap) if gap.before else None,
-        laws=_laws(gap, patched) if gap.laws else None,
+        laws=_law_residual_table(gap, patched) if gap.laws else None,
         heat_map=draw_heat_map(gap.before[0], gap.after[0], patched) if gap.before else None,
-        ranking=_ranking(gap), unlisted=len(gap.ranking) - _MAX_RANKED_EFFECTS, tests=_tests(gap),
+        ranking=_ranking(gap), unlisted=len(gap.ranking) - _MAX_RANKED_EFFECTS, tests=_residual_test_rows(gap),
         proof_words=_VALIDATION_TEXTS[mechanism].format(gap.before[0].run if gap.before else ""),
-        commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
-        noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_experiment(gap), notes=gap.notes,
+        commands=_COMMANDS[mechanism], open_loop=_open_loop_content(gap),
+        noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_next_experiment_content(gap), notes=gap.notes,
         unused=gap.unused_channels,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
@@ -106,7 +111,7 @@ _COMMANDS = {
 }  # fmt: skip
 
 
-def _open_loop(gap: Gap) -> dict[str, Any] | None:
+def _open_loop_content(gap: Gap) -> dict[str, Any] | None:
     """Return text and table rows of the open-loop position errors of a mechanism, per drive.
 
     The columns are the errors of the given and, if there is one, the corrected model.
@@ -127,7 +132,7 @@ def _open_loop(gap: Gap) -> dict[str, Any] | None:
     return {"words": words, "rows": rows}
 
 
-def _figures(gap: Gap) -> list[tuple[str, str, str]]:
+def _key_figure_cards(gap: Gap) -> list[tuple[str, str, str]]:
     size, closed, patched = gap.size, gap_closed(gap.size), has_patch(gap)
     cards = [("before", f"{size.before:.2f} × noise", "prediction error, given model")]
     if patched:
@@ -140,7 +145,7 @@ def _figures(gap: Gap) -> list[tuple[str, str, str]]:
 
 
 def _scale_interval(estimate: Estimate) -> report_html.Interval | None:
-    return scale_interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+    return scale_interval_to_pixels(estimate.value, estimate.low, estimate.high, estimate.nominal)
 
 
 def _effect_rows(gap: Gap) -> list[dict[str, Any]]:
@@ -207,15 +212,15 @@ def _residual_input_rows(gap: Gap) -> list[tuple[str, str, float]]:
 def _validation_content(gap: Gap) -> dict[str, Any]:
     before, after, patched = gap.before[0], gap.after[0], has_patch(gap)
     return {
-        "channels": _channels(before, after if patched else None),
+        "channels": _channel_error_rows(before, after if patched else None),
         "pictures": [
-            (channel_words(name), draw_channel(before, after, name, patched))
-            for name in most_changed_channels(before, after, _MAX_PLOTTED_CHANNELS)
+            (channel_words(name), draw_channel_predictions(before, after, name, patched))
+            for name in find_most_improved_channels(before, after, _MAX_PLOTTED_CHANNELS)
         ],
     }
 
 
-def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
+def _channel_error_rows(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
     """Return table rows of the RMS prediction error of each channel, in multiples of sensor noise.
 
     `before` is the prediction of the given model, `after` that of the corrected one, if there is one.
@@ -229,12 +234,12 @@ def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, An
         known = math.isfinite(b)
         sizes = [f"{b:.2f}" if known else "not measured"]
         sizes += [f"{a:.2f}" if known else ""] if after else []
-        drawn = scale_dumbbell(float(b), float(a) if after else None, low, high) if known else None
+        drawn = scale_dumbbell_to_pixels(float(b), float(a) if after else None, low, high) if known else None
         rows.append({"texts": (channel_words(channel), *sizes), "drawn": drawn})
     return rows
 
 
-def _laws(gap: Gap, is_patched: bool) -> dict[str, Any]:
+def _law_residual_table(gap: Gap, is_patched: bool) -> dict[str, Any]:
     """Return the table of the residuals of each physical law at each component, relative to noise.
 
     With a corrected model (`is_patched`), each component has two columns: given and patched.
@@ -244,12 +249,12 @@ def _laws(gap: Gap, is_patched: bool) -> dict[str, Any]:
     rows = []
     for law, by_place in gap.laws.items():
         unit = gap.law_units.get(law, "1")
-        cells = [_law_cell(by_place.get(place), key, unit) for place in places for key in keys]
+        cells = [_law_residual_cell(by_place.get(place), key, unit) for place in places for key in keys]
         rows.append({"law": law, "words": law_words(law), "cells": cells})
     return {"head": [(place, words) for place in places for words in keys.values()], "rows": rows}
 
 
-def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict[str, str]:
+def _law_residual_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict[str, str]:
     if residual is None or not math.isfinite(residual.get(key, math.nan)):
         return {"ratio": "", "size": "", "colour": ""}
     value, noise = residual[key], residual.get("noise", math.nan)
@@ -302,7 +307,7 @@ def _format_parameter(gap: Gap, candidate: Candidate, name: str) -> str:
     return f"{label} {amount(value, unit, name) if unit else f'{value:.3g}'}"
 
 
-def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
+def _residual_test_rows(gap: Gap) -> list[tuple[str, str, str, bool]]:
     """Return table rows of the residual tests of the final model: name, value, limit, passed."""
     return [
         (
@@ -323,7 +328,7 @@ def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
     """Return table rows of sensor noise per channel: estimated and stated standard deviation, ratio."""
     rows = []
     for channel, (found, stated) in gap.noise.items():
-        unit, known = default_unit(channel), math.isfinite(stated)
+        unit, known = default_channel_unit(channel), math.isfinite(stated)
         ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
         rows.append((channel_words(channel), amount(found, unit),
                      amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
@@ -338,7 +343,7 @@ def _alternative_rows(gap: Gap) -> list[tuple[str, ...]]:
     ]  # fmt: skip
 
 
-def _experiment(gap: Gap) -> dict[str, str] | None:
+def _next_experiment_content(gap: Gap) -> dict[str, str] | None:
     if not gap.next_experiment:
         return None
     scenario, written = gap.next_experiment.get("scenario"), ""
@@ -374,7 +379,7 @@ def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> by
     labels = [channel_words(channel) for channel in before.channels]
     loudest = np.nanpercentile(windowed_errors(before).rms, 99.5)
     top = float(np.clip(np.ceil(loudest), 2.0, _MAX_HEAT_MAP_RATIO))
-    with report_figure(0.24 * len(labels) + 1.3) as figure:
+    with open_report_figure(0.24 * len(labels) + 1.3) as figure:
         rows = figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0]
         meshes = []
         for axes, (title, prediction) in zip(rows, pairs, strict=True):
@@ -401,10 +406,10 @@ def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> by
         bar = figure.colorbar(meshes[0], ax=rows.tolist(), pad=0.015, aspect=26, extend="max")
         bar.set_label("RMS error / sensor noise [1]")
         bar.outline.set_visible(False)  # pyright: ignore - stubs lack the outline's type
-        return png(figure)
+        return figure_to_png(figure)
 
 
-def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched: bool) -> bytes:
+def draw_channel_predictions(before: Prediction, after: Prediction, channel: str, is_patched: bool) -> bytes:
     """Draw measurements, one-step predictions and errors of a channel, and an enlarged worst interval.
 
     Args:
@@ -417,15 +422,15 @@ def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched
         A PNG.
     """
     column = before.channels.index(channel)
-    unit, factor = axis_unit(default_unit(channel))
+    unit, factor = plot_axis_unit(default_channel_unit(channel))
     if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _MIN_CUSTOMARY_VALUE:
-        unit, factor = default_unit(channel), 1.0
+        unit, factor = default_channel_unit(channel), 1.0
     measured = factor * before.measured[:, column]
     lines = [("given model", NOMINAL_COLOUR, factor * before.predicted[:, column])]
     if is_patched:
         lines.append(("patched model", PATCHED_COLOUR, factor * after.predicted[:, column]))
     low, high = _worst_interval(before, column)
-    with report_figure(3.0) as figure:
+    with open_report_figure(3.0) as figure:
         places = figure.subplots(2, 2, height_ratios=(1.7, 1.0), width_ratios=(1.55, 1.0))
         for side, span in enumerate(((before.time[0], before.time[-1]), (low, high))):
             inside = (before.time >= span[0]) & (before.time <= span[1])
@@ -443,7 +448,7 @@ def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched
         places[0, 1].set_title(f"worst window, {low:.1f} to {high:.1f} s")
         places[1, 0].set_ylabel(f"measured -\npredicted\n[{unit}]")
         figure.align_ylabels()
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_law(law: LearnedLaw) -> bytes:
@@ -458,7 +463,7 @@ def draw_law(law: LearnedLaw) -> bytes:
     points, values, spread = (np.array(v) for v in (law.points, law.values, law.spread))
     along, per_point = display_unit(law.variable_unit, float(np.max(np.abs(points))))
     unit, per_value = display_unit(law.unit, float(np.max(np.abs(values))))
-    with report_figure(2.6) as figure:
+    with open_report_figure(2.6) as figure:
         axes = figure.subplots()
         low, high = per_value * (values - 2.0 * spread), per_value * (values + 2.0 * spread)
         axes.fill_between(per_point * points, low, high, color=PATCHED_COLOUR, alpha=0.2, lw=0)
@@ -466,7 +471,7 @@ def draw_law(law: LearnedLaw) -> bytes:
         axes.axhline(0.0, color="0.6", lw=0.8)
         axes.set_xlabel(f"{variable_words(law.variable)} [{along}]")
         axes.set_ylabel(f"added {_ADDED_QUANTITIES[law.balance]} [{unit}]")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def _plot_signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:

@@ -23,12 +23,12 @@ from hydrotele.identify.result import (
     parameter_rows,
 )
 from hydrotele.show import report_html
-from hydrotele.show.report_html import png, report_figure
+from hydrotele.show.report_html import figure_to_png, open_report_figure
 
 MEASURED_COLOUR, NOMINAL_COLOUR, IDENTIFIED_COLOUR = "#262b33", "#e07b00", "#1769aa"
 
 
-def draw_forces(forces: HeldOutForces, drive: str, judged: HeldOutError) -> bytes:
+def draw_force_predictions(forces: HeldOutForces, drive: str, judged: HeldOutError) -> bytes:
     """Draw measured and predicted force of a drive on the held-out run, and the errors with a noise band.
 
     Args:
@@ -47,7 +47,7 @@ def draw_forces(forces: HeldOutForces, drive: str, judged: HeldOutError) -> byte
         ("given model", NOMINAL_COLOUR, factor * forces.nominal[:, k]),
         ("identified model", IDENTIFIED_COLOUR, factor * forces.predicted[:, k]),
     ]
-    with report_figure(3.2) as figure:
+    with open_report_figure(3.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
         upper.plot(forces.time, measured, color=MEASURED_COLOUR, lw=2.2, alpha=0.5, label="measured")
         for name, colour, values in lines:
@@ -66,7 +66,7 @@ def draw_forces(forces: HeldOutForces, drive: str, judged: HeldOutError) -> byte
         upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False,
                      borderaxespad=0.1, fontsize=8.5)  # fmt: skip
         figure.align_ylabels()
-        return png(figure)
+        return figure_to_png(figure)
 
 
 _MAX_MEMBERS = 6  # maximum number of listed members of a combination
@@ -108,22 +108,24 @@ def write_identify_report(
         of = f"machine {source.name}, tool {source.tool}"
     status = identification.status if identification else hydraulics.status if hydraulics else ""
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
-    report_html.write_report(
+    report_html.write_template_report(
         "identify", path, title=f"{source.name}: identification",
         over=f"IDENTIFICATION REPORT  ·  {of}  ·  held-out run {source.heldout}, fitted on"
         f" {', '.join(source.fit)}",
         heading="Parameters identified from logs" if good else status,
         chip=("no_gap", "Identified") if good else ("ambiguous", "Incomplete"),
-        figures=_figures(identification, hydraulics), found=_mechanism(identification,
+        figures=_key_figure_cards(identification, hydraulics), found=_mechanism_content(identification,
         consistent) if identification else None,
-        hydraulics=_hydraulics(hydraulics) if hydraulics else None,
+        hydraulics=_hydraulics_content(hydraulics) if hydraulics else None,
         notes=identification.notes if identification else source.notes, version=hydrotele.__version__,
         runs=source.tool is not None,
         seconds=f"{sum(part.seconds for part in (identification, hydraulics) if part):.1f}",
     )  # fmt: skip
 
 
-def _figures(found: Identification | None, hydraulics: HydraulicIdentification | None) -> list[tuple[str, str, str]]:
+def _key_figure_cards(
+    found: Identification | None, hydraulics: HydraulicIdentification | None
+) -> list[tuple[str, str, str]]:
     cards = []
     for drive, h in list(found.heldout.items())[:3] if found else ():
         against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
@@ -139,7 +141,7 @@ def _display_name(drive: str) -> str:
     return drive.replace("_", " ")
 
 
-def _mechanism(found: Identification, best: ConsistentParameters | None) -> dict[str, Any]:
+def _mechanism_content(found: Identification, best: ConsistentParameters | None) -> dict[str, Any]:
     forces = [
         (_display_name(drive), amount(h.nominal_rms, h.unit), amount(h.rms, h.unit),
          amount(h.noise_rms, h.unit) if math.isfinite(h.noise_rms) else "not stated",
@@ -148,17 +150,17 @@ def _mechanism(found: Identification, best: ConsistentParameters | None) -> dict
     ]  # fmt: skip
     return {
         "run": found.forces.run, "band": f"{found.band:.3g}", "forces": forces,
-        "pictures": [(drive, draw_forces(found.forces, drive, h))
+        "pictures": [(drive, draw_force_predictions(found.forces, drive, h))
                      for drive, h in found.heldout.items()],
         "condition": f"{found.estimate.condition:.3g}", "parameters": _parameters(found),
-        "tests": _tests(found, best), "statuses": _statuses(found),
+        "tests": _consistency_test_rows(found, best), "statuses": _identifiability_rows(found),
         "correlation": ", ".join(f"{_display_name(drive)} {r:.2f}" for drive,
         r in found.residual_autocorrelation.items()),
     }  # fmt: skip
 
 
 def _scale_interval(estimate: Estimate) -> report_html.Interval | None:
-    return report_html.scale_interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+    return report_html.scale_interval_to_pixels(estimate.value, estimate.low, estimate.high, estimate.nominal)
 
 
 def _parameters(found: Identification) -> list[dict[str, Any]]:
@@ -176,7 +178,7 @@ def _parameters(found: Identification) -> list[dict[str, Any]]:
     return rows
 
 
-def _tests(found: Identification, best: ConsistentParameters | None) -> list[tuple[str, ...]]:
+def _consistency_test_rows(found: Identification, best: ConsistentParameters | None) -> list[tuple[str, ...]]:
     distance, limit = found.squared_distance(found.nominal)
     verdict = "consistent with the logs" if distance <= limit else "rejected by the logs"
     rows = [("given parameters", f"{distance:.3g}", f"{limit:.3g}", verdict)]
@@ -188,7 +190,7 @@ def _tests(found: Identification, best: ConsistentParameters | None) -> list[tup
     return rows
 
 
-def _statuses(found: Identification) -> list[tuple[str, ...]]:
+def _identifiability_rows(found: Identification) -> list[tuple[str, ...]]:
     rows = parameter_rows(found)
     parts = []
     for status, number in count_statuses(rows).items():
@@ -205,7 +207,7 @@ def _shorten_combination(combination: str) -> str:
     return " + ".join(parts[:_MAX_MEMBERS]).replace("+ -", "- ") + f" + {len(parts) - _MAX_MEMBERS} more"
 
 
-def _hydraulics(found: HydraulicIdentification) -> dict[str, Any]:
+def _hydraulics_content(found: HydraulicIdentification) -> dict[str, Any]:
     rows = []
     for n in found.parameters:
         estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)

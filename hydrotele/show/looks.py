@@ -27,10 +27,10 @@ class Mesh(NamedTuple):
     triangles: np.ndarray
 
 
-def box(half_sizes) -> Mesh:
+def make_box_mesh(half_sizes) -> Mesh:
     """Create the triangle mesh of a box with half edge lengths (3,) [m] and flat faces.
 
-    >>> box((1, 2, 3)).vertices.max(axis=0).tolist()
+    >>> make_box_mesh((1, 2, 3)).vertices.max(axis=0).tolist()
     [1.0, 2.0, 3.0]
     """
     vertices, normals, triangles = [], [], []
@@ -73,10 +73,10 @@ def revolution_mesh(radii, heights, profile_normals, segments: int = 24) -> Mesh
     high = low + segments + 1
     quads = np.stack([low, low + 1, high + 1, low, high + 1, high], axis=-1).reshape(-1, 3)
     mesh = Mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), quads)
-    return mesh._replace(triangles=quads[_areas(mesh) > 0.0])
+    return mesh._replace(triangles=quads[_doubled_triangle_areas(mesh) > 0.0])
 
 
-def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
+def make_cylinder_mesh(radius: float, half_length: float, segments: int = 24) -> Mesh:
     """Create the triangle mesh of a closed cylinder along z, with radius and half length [m]."""
     r, h = radius, half_length
     return revolution_mesh(
@@ -87,7 +87,7 @@ def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
     )
 
 
-def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
+def make_capsule_mesh(radius: float, half_length: float, segments: int = 16) -> Mesh:
     """Create the triangle mesh of a capsule along z [m]; `half_length` excludes the hemispheres."""
     rise = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 2)
     rise = np.sort(np.append(rise, (0.0, 0.0)))
@@ -97,15 +97,15 @@ def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
     return revolution_mesh(radius * slopes[:, 0], heights, slopes, segments)
 
 
-def ellipsoid(radii, segments: int = 24) -> Mesh:
+def make_ellipsoid_mesh(radii, segments: int = 24) -> Mesh:
     """Create the triangle mesh of an ellipsoid with radii (3,) [m] along x, y and z."""
-    ball = capsule(1.0, 0.0, segments)
+    ball = make_capsule_mesh(1.0, 0.0, segments)
     normals = ball.normals / np.asarray(radii)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return Mesh(ball.vertices * np.asarray(radii), normals, ball.triangles)
 
 
-def flat_triangles(corners: np.ndarray) -> Mesh:
+def make_flat_triangle_mesh(corners: np.ndarray) -> Mesh:
     """Create a mesh with flat shading from the corners of t triangles (t, 3 corners, 3) [m].
 
     The corners of a triangle are counter-clockwise as seen from outside.
@@ -117,7 +117,7 @@ def flat_triangles(corners: np.ndarray) -> Mesh:
     return Mesh(corners.reshape(-1, 3), np.repeat(normals, 3, axis=0), triangles)
 
 
-def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
+def make_chequered_square(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
     """Create the mesh of a chequered square of count x count tiles in the plane z = 0.
 
     Args:
@@ -133,7 +133,7 @@ def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
         np.stack([edges[i + a], edges[j + b], np.zeros((count, count))], axis=-1)
         for a, b in ((0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1))
     ]
-    mesh = flat_triangles(np.stack(corners, axis=2).reshape(-1, 3, 3))
+    mesh = make_flat_triangle_mesh(np.stack(corners, axis=2).reshape(-1, 3, 3))
     return mesh, np.repeat(((i + j) % 2).ravel(), 6)
 
 
@@ -157,7 +157,7 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _areas(mesh: Mesh) -> np.ndarray:
+def _doubled_triangle_areas(mesh: Mesh) -> np.ndarray:
     a, b, c = (mesh.vertices[mesh.triangles[:, k]] for k in range(3))
     return np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
@@ -167,11 +167,13 @@ _DEFAULT_COLOUR = (0.5, 0.5, 0.5, 1.0)  # default of MuJoCo; the colour of a mat
 
 _Geom = mujoco.mjtGeom
 _PRIMITIVES: Mapping[int, Callable[[np.ndarray], Mesh]] = {
-    int(_Geom.mjGEOM_BOX): lambda size: shapes.box(size),
-    int(_Geom.mjGEOM_CYLINDER): lambda size: shapes.cylinder(size[0], size[1], _n_segments(size[0])),
-    int(_Geom.mjGEOM_CAPSULE): lambda size: shapes.capsule(size[0], size[1], _n_segments(size[0])),
-    int(_Geom.mjGEOM_SPHERE): lambda size: shapes.ellipsoid((size[0],) * 3),
-    int(_Geom.mjGEOM_ELLIPSOID): lambda size: shapes.ellipsoid(size),
+    int(_Geom.mjGEOM_BOX): lambda size: shapes.make_box_mesh(size),
+    int(_Geom.mjGEOM_CYLINDER): lambda size: shapes.make_cylinder_mesh(
+        size[0], size[1], _choose_segment_count(size[0])
+    ),
+    int(_Geom.mjGEOM_CAPSULE): lambda size: shapes.make_capsule_mesh(size[0], size[1], _choose_segment_count(size[0])),
+    int(_Geom.mjGEOM_SPHERE): lambda size: shapes.make_ellipsoid_mesh((size[0],) * 3),
+    int(_Geom.mjGEOM_ELLIPSOID): lambda size: shapes.make_ellipsoid_mesh(size),
 }
 
 
@@ -253,7 +255,7 @@ def ground_height(model: mujoco.MjModel) -> float | None:
     return float(model.geom_pos[planes][0, 2]) if planes.any() else None
 
 
-def _n_segments(radius: float) -> int:
+def _choose_segment_count(radius: float) -> int:
     """Return the number of segments around the axis of a round mesh with a radius [m]; thin ones need fewer."""
     return 10 if radius < 0.06 else 24
 
@@ -276,4 +278,4 @@ def _mesh_asset(model: mujoco.MjModel, mesh: int) -> Mesh:
     faces = slice(first, first + model.mesh_facenum[mesh])
     corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
     normals = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]]
-    return shapes.flat_triangles(corners)._replace(normals=normals.reshape(-1, 3))
+    return shapes.make_flat_triangle_mesh(corners)._replace(normals=normals.reshape(-1, 3))

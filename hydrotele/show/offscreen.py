@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 
-def main(folder: Path) -> None:
+def render_task_folder(folder: Path) -> None:
     """Render the model in a folder with the pose, camera and size of `task.npz`; write `pixels.npy`."""
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     task = np.load(folder / "task.npz")
@@ -32,4 +32,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    render_task_folder(Path(sys.argv[1]))

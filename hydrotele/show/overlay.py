@@ -19,14 +19,14 @@ from hydrotele.machine.signals import parse_channel
 from hydrotele.show.channels import (
     TITLES,
     Trace,
-    colours,
+    assign_axis_colours,
     common_channels,
-    difference,
+    compute_channel_difference,
     group_channels,
     padded_range,
-    scaled_channel,
+    scale_channel_for_plot,
 )
-from hydrotele.show.report_html import png, report_figure, show_dollar_signs
+from hydrotele.show.report_html import figure_to_png, open_report_figure, print_dollar_signs_literally
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +93,7 @@ def plot_overlay(
             *zip(names, (_FIRST_COLOUR, _OTHER_COLOUR), strict=True),
             (" - ".join(names), _DIFFERENCE_COLOUR),
         ]
-        _heading(figure, title or f"{' and '.join(names)}: {runs}", keys)
+        _draw_title_and_legend(figure, title or f"{' and '.join(names)}: {runs}", keys)
 
 
 def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = None, title: str = "") -> None:
@@ -114,17 +114,17 @@ def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = N
     columns = 2 if len(groups) > 4 else 1
     rows = -(-len(groups) // columns)
     default = columns * _PANEL[0], rows * _PANEL[1] + _HEADER + _FOOTER
-    palette = {axis: tuple(0.85 * c / 255 for c in rgb) for axis, rgb in colours([log]).items()}
+    palette = {axis: tuple(0.85 * c / 255 for c in rgb) for axis, rgb in assign_axis_colours([log]).items()}
     with _png_figure(path, size or default) as figure:
         grid = _grid(figure, rows, columns)
         for place, (kind, names) in enumerate(groups.items()):
             axes = figure.add_subplot(grid[place % rows, place // rows])
-            traces = [scaled_channel(log, name) for name in names]
+            traces = [scale_channel_for_plot(log, name) for name in names]
             for trace in traces:
                 axes.plot(log.time, trace.values, color=palette[trace.channel.axis], lw=1.0)
             _format_axes(axes, log.time, traces, TITLES.get(kind, kind))
             axes.set_xlabel("time [s]" if place % rows == rows - 1 else "")
-        _heading(figure, title or log.name, [(axis, c) for axis, c in palette.items() if axis])
+        _draw_title_and_legend(figure, title or log.name, [(axis, c) for axis, c in palette.items() if axis])
 
 
 def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
@@ -132,14 +132,14 @@ def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -
     cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
     upper = figure.add_subplot(cell[0])
     lower = figure.add_subplot(cell[1], sharex=upper)
-    ours, theirs = scaled_channel(first, name), scaled_channel(other, name)
+    ours, theirs = scale_channel_for_plot(first, name), scale_channel_for_plot(other, name)
     upper.plot(first.time, ours.values, color=_FIRST_COLOUR, lw=1.9)
     upper.plot(other.time, theirs.values, color=_OTHER_COLOUR, lw=0.9)
     what = TITLES.get(ours.channel.kind, ours.channel.kind)
     heading = f"{ours.channel.axis} {what}" if ours.channel.axis else what
     _format_axes(upper, first.time, [ours, theirs], heading)
     upper.tick_params(labelbottom=False)
-    time, gap = difference(first, other, name)
+    time, gap = compute_channel_difference(first, other, name)
     lower.plot(time, gap.values, color=_DIFFERENCE_COLOUR, lw=0.8)
     _format_axes(lower, first.time, [gap], "")
     rms = float(np.sqrt(np.mean(gap.values**2)))
@@ -171,7 +171,7 @@ def _png_figure(path: str | os.PathLike, size: tuple[int, int]) -> Iterator["Fig
         figure = Figure(figsize=(size[0] / _DPI, size[1] / _DPI), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
         yield figure
-        show_dollar_signs(figure)
+        print_dollar_signs_literally(figure)
         figure.savefig(part, dpi=_DPI)
 
 
@@ -183,7 +183,7 @@ def _grid(figure: "Figure", rows: int, columns: int):
     )  # fmt: skip
 
 
-def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> None:
+def _draw_title_and_legend(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> None:
     """Draw title and common legend at the top of a figure; `keys` are (name, colour) of the lines."""
     from matplotlib.lines import Line2D
 
@@ -219,7 +219,7 @@ def draw_open_loop_predictions(
     Returns:
         A PNG.
     """
-    with report_figure(0.7 + _PANEL_HEIGHT * len(channels)) as figure:
+    with open_report_figure(0.7 + _PANEL_HEIGHT * len(channels)) as figure:
         plots = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
         for c, (plot, channel, unit) in enumerate(zip(plots, channels, units, strict=True)):
             known = measured[:, c][np.isfinite(measured[:, c])]
@@ -239,4 +239,4 @@ def draw_open_loop_predictions(
         plots[-1].set_xlabel("time [s]")
         plots[-1].set_xlim(time[0], time[-1])
         figure.align_ylabels()
-        return png(figure)
+        return figure_to_png(figure)

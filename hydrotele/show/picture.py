@@ -28,7 +28,7 @@ _FIELD_OF_VIEW = 45.0  # deg, field of view of MuJoCo's free camera
 _TIMEOUT = 120.0  # s, for one image
 
 
-def render_picture(
+def render_machine(
     machine: Machine,
     path: str | os.PathLike,
     joints: Mapping[str, float] | None = None,
@@ -80,7 +80,7 @@ def render_model(
         camera = _FREE
     if camera not in (*cameras, _FREE):
         raise InputError(f"camera {camera!r}", f"choose one of {', '.join((*cameras, _FREE))}")
-    view = _free_view(model, data, size) if camera == _FREE else {"fixed": cameras.index(camera)}
+    view = _compute_free_camera(model, data, size) if camera == _FREE else {"fixed": cameras.index(camera)}
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.quality.offsamples = 8
     model.vis.quality.shadowsize = 8192
@@ -95,7 +95,7 @@ def save_png(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, format="PNG")
 
 
-def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
+def _compute_free_camera(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
     """Return settings of a free camera, obliquely from above, that shows the whole model.
 
     Returns:

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SurroundingObject, logged_soil
+from hydrotele.scenario.scenario import SurroundingObject, read_soil_from_log
 from hydrotele.simulate.closure import close_along_motion, dependent_joints
 from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
@@ -48,7 +48,7 @@ def compile_visual_model(
     return mjcf_document(root).compile()
 
 
-def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
+def extract_joint_motion(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     """Return the logged motion of the joints of a machine that no closed loop determines.
 
     Measured channels are preferred. True channels are used for joints without a sensor, such as a
@@ -72,11 +72,11 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
             f"{truth}{kind}.{name}" for truth in ("", "truth.") for name in names for kind in ("angle", "position")
         ]
         if column := next((c for c in candidates if c in log), None):
-            found[joint] = _hold_missing(log[column])
+            found[joint] = _repeat_last_known_value(log[column])
     return found
 
 
-def _hold_missing(values: np.ndarray) -> np.ndarray:
+def _repeat_last_known_value(values: np.ndarray) -> np.ndarray:
     """Fill missing values (NaN) with the last known value, at the start with the first; 0 if none is known."""
     known = np.flatnonzero(np.isfinite(values))
     if len(known) in (0, len(values)):
@@ -92,7 +92,7 @@ def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
     """
     if "surroundings" in log.metadata:
         return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata["surroundings"]))
-    return logged_soil(log)
+    return read_soil_from_log(log)
 
 
 def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
@@ -108,21 +108,21 @@ def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             for k, letter in enumerate("xyz"):
                 rows[:, place + k] = log[f"truth.position.{name}_{letter}"]
-            _write_quaternions(log, name, rows[:, place + 3 : place + 7])
+            _write_object_quaternions(log, name, rows[:, place + 3 : place + 7])
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            _write_quaternions(log, name.removesuffix("_turn"), rows[:, place : place + 4])
+            _write_object_quaternions(log, name.removesuffix("_turn"), rows[:, place : place + 4])
         else:
             rows[:, place] = log[f"truth.position.{name}"]
 
 
-def _write_quaternions(log: Log, name: str, quaternions: np.ndarray) -> None:
+def _write_object_quaternions(log: Log, name: str, quaternions: np.ndarray) -> None:
     turns = np.column_stack([log[f"truth.angle.{name}_r{c}"] for c in "xyz"])
     for quaternion, turn in zip(quaternions, turns, strict=True):
         quaternion[:] = (1.0, 0.0, 0.0, 0.0)
         mujoco.mju_quatIntegrate(quaternion, turn, 1.0)
 
 
-def logged_positions(
+def compute_joint_positions(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
 ) -> np.ndarray:  # fmt: skip
@@ -164,7 +164,7 @@ def body_poses(
     Raises:
         InputError: a linkage cannot be closed in at least one row.
     """
-    return poses_at_positions(model, logged_positions(machine, model, joints, log))
+    return poses_at_positions(model, compute_joint_positions(machine, model, joints, log))
 
 
 def poses_at_positions(model: mujoco.MjModel, rows: np.ndarray) -> Poses:

@@ -22,19 +22,19 @@ from hydrotele.scenario.scenario import SoilGround
 from hydrotele.show import looks as shapes
 from hydrotele.show.channels import (
     TITLES,
-    colours,
+    assign_axis_colours,
     common_channels,
-    difference,
+    compute_channel_difference,
     group_channels,
     padded_range,
-    scaled_channel,
+    scale_channel_for_plot,
 )
 from hydrotele.show.looks import BodyMesh, body_meshes, ground_height, visible_bounds
 from hydrotele.show.pose import (
     Poses,
     body_poses,
     compile_visual_model,
-    logged_joints,
+    extract_joint_motion,
     logged_surroundings,
     point_trajectory,
 )
@@ -42,9 +42,9 @@ from hydrotele.show.soil import (
     LOOSE_COLOUR,
     SoilHistory,
     SoilShape,
-    load_mesh,
+    make_bucket_load_mesh,
+    make_ground_around_trench,
     soil_history,
-    surrounding_tiles,
     trench_mesh,
 )
 
@@ -197,16 +197,18 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
         kinds = [kind for kind in _COMPARED_KINDS if kind in gap_of] or list(gap_of)
         pairs = [(by_kind[kind], gap_of[kind]) for kind in kinds[:3]]
         views = [plot for pair in pairs for plot in pair]
-        tabs.append(_column("Comparison", views, minus, [2, 1] * len(pairs)))
+        tabs.append(_make_plot_column("Comparison", views, minus, [2, 1] * len(pairs)))
     for title, kinds in _TAB_KINDS.items():
         if views := [by_kind[kind] for kind in kinds if kind in by_kind]:
-            tabs.append(_column(title, views, minus))
+            tabs.append(_make_plot_column(title, views, minus))
     if differences:
-        tabs.append(_column("Differences", list(differences), minus))
+        tabs.append(_make_plot_column("Differences", list(differences), minus))
     return tabs
 
 
-def _column(title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None) -> "rrb.Vertical":
+def _make_plot_column(
+    title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None
+) -> "rrb.Vertical":
     """Arrange plots in a column; show a legend only for lines that no plot above has named.
 
     Args:
@@ -223,12 +225,12 @@ def _column(title: str, plots: Sequence[Plot], minus: str, shares: Sequence[floa
         legend = len(plot.labels) > 1 and not named.issuperset(plot.labels)
         if legend:
             named.update(plot.labels, (label.split()[-1] for label in plot.labels))
-        views.append(_view(plot, minus if plot.is_difference else "", legend))
+        views.append(_make_plot_view(plot, minus if plot.is_difference else "", legend))
         heights.append(share * (_LEGEND_PLOT_HEIGHT if legend else 1.0))
     return rrb.Vertical(*views, name=title, row_shares=heights)
 
 
-def _view(plot: Plot, minus: str, legend: bool) -> "rrb.TimeSeriesView":
+def _make_plot_view(plot: Plot, minus: str, legend: bool) -> "rrb.TimeSeriesView":
     import rerun.blueprint as rrb
 
     units = ", ".join("-" if unit == "1" else unit for unit in plot.units)
@@ -281,13 +283,13 @@ def log_machine(
             continue
         part = "shape" if look.opacity == 1.0 else f"glass_{round(100 * look.opacity)}"
         path = f"{root}/{poses.bodies[look.body]}/{part}"
-        stream.log(path, mesh_entity(look, ghost), static=True)
+        stream.log(path, make_rerun_mesh(look, ghost), static=True)
     for body, name in enumerate(poses.bodies):
         if body in moving or not ghost:
             _log_body_poses(stream, f"{root}/{name}", poses, body, clock, static=body not in moving)
 
 
-def mesh_entity(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
+def make_rerun_mesh(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
     """Convert the mesh of a body to a rerun mesh; a ghost (second machine) is tinted and transparent."""
     import rerun as rr
 
@@ -317,11 +319,11 @@ def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel, soil: SoilHi
     if height is None:
         return False
     if soil:
-        mesh, parity = surrounding_tiles(soil.bed, _GROUND_HALF_SIZE, _TILE_LENGTH)
+        mesh, parity = make_ground_around_trench(soil.bed, _GROUND_HALF_SIZE, _TILE_LENGTH)
     else:
-        mesh, parity = shapes.tiles(_GROUND_HALF_SIZE, round(2.0 * _GROUND_HALF_SIZE / _TILE_LENGTH))
+        mesh, parity = shapes.make_chequered_square(_GROUND_HALF_SIZE, round(2.0 * _GROUND_HALF_SIZE / _TILE_LENGTH))
     mesh = shapes.transform_mesh(mesh, (0.0, 0.0, height), np.eye(3))
-    stream.log("ground", mesh_entity(BodyMesh(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
+    stream.log("ground", make_rerun_mesh(BodyMesh(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
     return True
 
 
@@ -343,21 +345,21 @@ def log_soil(stream: "rr.RecordingStream", root: str, bucket: str, soil: SoilHis
     for row, shape in enumerate(soil.shapes):
         stream.set_time(TIMELINE, duration=float(time[row]))
         is_last = row == len(time) - 1
-        if drawn is None or ((time[row] - drawn_at >= _SOIL_PERIOD or is_last) and _has_moved(drawn, shape)):
+        if drawn is None or ((time[row] - drawn_at >= _SOIL_PERIOD or is_last) and _has_soil_changed(drawn, shape)):
             mesh, colours = trench_mesh(soil.bed, shape)
-            stream.log(f"{root}/soil", mesh_entity(BodyMesh(0, 1.0, mesh, colours.astype(np.uint8))))
+            stream.log(f"{root}/soil", make_rerun_mesh(BodyMesh(0, 1.0, mesh, colours.astype(np.uint8))))
             drawn_at, drawn = time[row], shape
         if not np.array_equal(load, shape.load):
             load, path = shape.load, f"{root}/{bucket}/load"
-            if (mesh := load_mesh(soil, row)) is None:
+            if (mesh := make_bucket_load_mesh(soil, row)) is None:
                 stream.log(path, rr.Clear(recursive=False))
             else:
                 colours = np.tile(LOOSE_COLOUR, (len(mesh.vertices), 1)).astype(np.uint8)
-                stream.log(path, mesh_entity(BodyMesh(0, 1.0, mesh, colours)))
+                stream.log(path, make_rerun_mesh(BodyMesh(0, 1.0, mesh, colours)))
     stream.reset_time()
 
 
-def _has_moved(before: SoilShape, now: SoilShape) -> bool:
+def _has_soil_changed(before: SoilShape, now: SoilShape) -> bool:
     return not (np.array_equal(before.surface, now.surface) and np.array_equal(before.loose, now.loose))
 
 
@@ -482,8 +484,8 @@ def _log_machines(stream, entries) -> Scene:
         if key not in models:
             models[key] = compile_visual_model(machine, surroundings=things)
         model = models[key]
-        poses = body_poses(machine, model, logged_joints(machine, log), log)
-        clock, tip = time_column(log.time), tip_path(machine, log, poses)
+        poses = body_poses(machine, model, extract_joint_motion(machine, log), log)
+        clock, tip = time_column(log.time), compute_tip_path(machine, log, poses)
         log_machine(stream, f"/{name}/machine", model, poses, clock, ghost=scene is not None)
         log_tip(stream, f"/{name}/tip_path", tip, clock, scene is not None)
         grounds = [thing for thing in things if isinstance(thing, SoilGround)]
@@ -491,7 +493,7 @@ def _log_machines(stream, entries) -> Scene:
         contents += [f"/{name}/machine/**", f"/{name}/tip_path/**"]
         trails.append(f"/{name}/tip_path/trail")
         if scene is None:
-            eye, target = view_of_machine(model, tip)
+            eye, target = compute_machine_camera(model, tip)
             ground = log_ground(stream, model, soil)
             if soil and machine.arm:
                 log_soil(stream, f"/{name}/machine", machine.arm.tip.link, soil, log.time)
@@ -506,7 +508,7 @@ def _scene_title(names: list[str]) -> str:
     return f"{solid} (solid), {', '.join(glass)} (transparent blue)" if glass else "machine"
 
 
-def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+def compute_tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
     """Return the path of the tool tip (n, 3) in the world [m]; None for a machine without an arm.
 
     It is the true path if the log contains it, else it is computed from the body poses.
@@ -519,7 +521,7 @@ def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
     return point_trajectory(poses, machine.arm.tip.link, machine.arm.tip.position)
 
 
-def view_of_machine(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def compute_machine_camera(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Compute a camera that shows the whole machine and, if given, the whole path of its tip (n, 3).
 
     The direction is that of the camera `overview` if the model has one.
@@ -543,12 +545,12 @@ def _log_channels(stream, entries) -> list[Plot]:
     import rerun as rr
 
     logs = [log for _, log in entries.values()]
-    palette, drawn = colours(logs), {}
+    palette, drawn = assign_axis_colours(logs), {}
     for rank, (name, (_, log)) in enumerate(entries.items()):
         clock, groups = time_column(log.time), group_channels(log.columns)
         members = {channel: kind for kind, some in groups.items() for channel in some}
         for channel in log.columns:
-            trace = scaled_channel(log, channel)
+            trace = scale_channel_for_plot(log, channel)
             path = entity_path(name, channel)
             label = f"{name} {trace.legend_name}" if len(entries) > 1 else trace.legend_name
             width = 1.0 if rank else 3.0 if len(entries) > 1 else 1.6
@@ -557,19 +559,19 @@ def _log_channels(stream, entries) -> list[Plot]:
             stream.send_columns(path, [clock], rr.Scalars.columns(scalars=trace.values))
             if channel in members:
                 drawn.setdefault(members[channel], []).append((path, label, trace))
-    return _plots(drawn)
+    return _make_plots(drawn)
 
 
 def _log_differences(stream, entries) -> list[Plot]:
     import rerun as rr
 
     (_, (_, log)), *others = entries.items()
-    palette, drawn = colours([log]), {}
+    palette, drawn = assign_axis_colours([log]), {}
     for rank, (name, (_, other)) in enumerate(others):
         groups = group_channels(common_channels(log, other))
         for kind, channels in groups.items():
             for channel in channels:
-                time, trace = difference(log, other, channel)
+                time, trace = compute_channel_difference(log, other, channel)
                 path = entity_path(f"difference/{name}", channel)
                 label = f"{name} {trace.legend_name}" if len(others) > 1 else trace.legend_name
                 style = _line_style(palette[trace.channel.axis], f"{label} [{trace.unit}]", rank)
@@ -577,10 +579,10 @@ def _log_differences(stream, entries) -> list[Plot]:
                 columns = rr.Scalars.columns(scalars=trace.values)
                 stream.send_columns(path, [time_column(time)], columns)
                 drawn.setdefault(kind, []).append((path, label, trace))
-    return _plots(drawn, is_difference=True)
+    return _make_plots(drawn, is_difference=True)
 
 
-def _plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[Plot]:
+def _make_plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[Plot]:
     plots = []
     for kind, lines in drawn.items():
         paths, labels, traces = zip(*lines, strict=True)
@@ -605,7 +607,7 @@ def _about_document(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocum
     lines = []
     for name, (machine, log) in entries.items():
         lost = [axis.joint for axis in machine.axes.values()]
-        lost = [joint for joint in lost if joint not in logged_joints(machine, log)]
+        lost = [joint for joint in lost if joint not in extract_joint_motion(machine, log)]
         lines += [
             f"# {name}",
             f"- machine **{machine.name}**, tool **{machine.tool}**: {machine.description}",

@@ -44,7 +44,7 @@ def _choose_font() -> str:
     return next((name for name in _FONTS if name in present), "DejaVu Sans")
 
 
-def show_dollar_signs(figure: "Figure") -> None:
+def print_dollar_signs_literally(figure: "Figure") -> None:
     """Make a figure show dollar signs in its texts as they are, not as mathematical formulas.
 
     A name such as `$x` may be no valid formula. Only the labels of logarithmic axes are formulas.
@@ -60,9 +60,9 @@ def show_dollar_signs(figure: "Figure") -> None:
             text.set_parse_math(False)
 
 
-def png(figure: "Figure") -> bytes:
+def figure_to_png(figure: "Figure") -> bytes:
     """Render a matplotlib figure and return it as PNG bytes."""
-    show_dollar_signs(figure)
+    print_dollar_signs_literally(figure)
     stream = io.BytesIO()
     figure.savefig(stream, dpi=_DPI, format="png")
     return stream.getvalue()
@@ -72,7 +72,7 @@ def svg(figure: "Figure") -> bytes:
     """Render a matplotlib figure and return it as SVG bytes, equal for equal figures."""
     import matplotlib
 
-    show_dollar_signs(figure)
+    print_dollar_signs_literally(figure)
     stream = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "hydrotele"}):
         figure.savefig(stream, format="svg", metadata={"Date": None})
@@ -80,7 +80,7 @@ def svg(figure: "Figure") -> bytes:
 
 
 @contextlib.contextmanager
-def report_figure(height: float) -> Iterator["Figure"]:
+def open_report_figure(height: float) -> Iterator["Figure"]:
     """Create a matplotlib figure in the style and width of a report, with a height [inch]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -93,7 +93,7 @@ def report_figure(height: float) -> Iterator["Figure"]:
 
 
 @functools.cache
-def _environment() -> Any:
+def _make_template_environment() -> Any:
     import jinja2
 
     environment = jinja2.Environment(
@@ -108,7 +108,7 @@ def _data_uri(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode('ascii')}"
 
 
-def write_report(template: str, path: str | Path, **content: object) -> None:
+def write_template_report(template: str, path: str | Path, **content: object) -> None:
     """Fill a Jinja template with values and write it as one self-contained HTML file.
 
     Args:
@@ -116,7 +116,7 @@ def write_report(template: str, path: str | Path, **content: object) -> None:
         path: HTML file to write.
         content: variables of the template.
     """
-    text = _environment().get_template(f"{template}.html.j2").render(content)
+    text = _make_template_environment().get_template(f"{template}.html.j2").render(content)
     Path(path).write_text(text, encoding="utf-8")
 
 
@@ -156,7 +156,7 @@ def write_sections(
         sections: sections of the report.
         figures: key figures as (class, number, label), shown large.
     """
-    write_report(
+    write_template_report(
         "sections", path, title=overline, over=overline, heading=heading, lead=lead, sections=sections,
         figures=figures,
     )  # fmt: skip
@@ -172,12 +172,12 @@ class Interval(NamedTuple):
     model: float | None
 
 
-def scale_interval(value: float, low: float, high: float, model: float) -> Interval | None:
+def scale_interval_to_pixels(value: float, low: float, high: float, model: float) -> Interval | None:
     """Scale an estimate, its interval and the model value to positions in a small drawing [px].
 
     Values that are not finite have the position None; the result is None if no value is finite.
 
-    >>> scale_interval(1.5, 1.0, 2.0, 0.0)
+    >>> scale_interval_to_pixels(1.5, 1.0, 2.0, 0.0)
     Interval(width=220, value=159.0, start=110.0, length=98.0, model=12.0)
     """
     finite = [v for v in (value, low, high, model) if math.isfinite(v)]
@@ -202,7 +202,7 @@ class Dumbbell(NamedTuple):
     after: float | None
 
 
-def scale_dumbbell(before: float, after: float | None, low: float, high: float) -> Dumbbell:
+def scale_dumbbell_to_pixels(before: float, after: float | None, low: float, high: float) -> Dumbbell:
     """Scale error ratios before and after a correction to positions in a small drawing [px].
 
     Args:
@@ -216,7 +216,7 @@ def scale_dumbbell(before: float, after: float | None, low: float, high: float) 
     """
     width = 440
 
-    def place(size: float) -> float:
+    def to_pixels(size: float) -> float:
         return round(8 + (width - 16) * (size - low) / (high - low), 1)
 
-    return Dumbbell(width, place(1.0), place(before), None if after is None else place(after))
+    return Dumbbell(width, to_pixels(1.0), to_pixels(before), None if after is None else to_pixels(after))

@@ -13,8 +13,8 @@ import numpy as np
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import SoilGround
-from hydrotele.show.canvas import Marker, box
-from hydrotele.show.looks import Mesh, flat_triangles
+from hydrotele.show.canvas import Marker, make_box_marker
+from hydrotele.show.looks import Mesh, make_flat_triangle_mesh
 from hydrotele.show.pose import Poses, point_trajectory
 from hydrotele.simulate.soil_bed import SoilBed
 from hydrotele.soil.facts import CARRIED_VOLUME, INNER_WIDTH, REPOSE
@@ -83,14 +83,14 @@ def soil_history(machine: Machine, ground: SoilGround, log: Log, poses: Poses) -
         bed.step(edges[row], velocity[row], ahead[row], float(period))
         c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
         attitude = math.atan2(ahead[row, 2], c * ahead[row, 0] + s * ahead[row, 1])
-        shapes.append(SoilShape(bed.surface.copy(), bed.loose.copy(), _load_outline(bed, attitude)))
+        shapes.append(SoilShape(bed.surface.copy(), bed.loose.copy(), _bucket_load_outline(bed, attitude)))
     forward = np.array(arm.tip.position) / np.linalg.norm(arm.tip.position)
     joint = machine.joints[arm.tool].axis if arm.tool else (0.0, 1.0, 0.0)
-    left = np.array(joint) * _side_of_axis(poses, arm.tip.link, np.array(joint), bed.azimuth)
+    left = np.array(joint) * _lateral_axis_sign(poses, arm.tip.link, np.array(joint), bed.azimuth)
     return SoilHistory(bed, shapes, np.stack([forward, left, np.cross(forward, left)]))
 
 
-def _side_of_axis(poses: Poses, link: str, axis: np.ndarray, azimuth: float) -> float:
+def _lateral_axis_sign(poses: Poses, link: str, axis: np.ndarray, azimuth: float) -> float:
     """Return 1 if an axis of a link points to the left of the vertical plane of the arm, else -1.
 
     Args:
@@ -103,7 +103,7 @@ def _side_of_axis(poses: Poses, link: str, axis: np.ndarray, azimuth: float) -> 
     return 1.0 if tip @ [-math.sin(azimuth), math.cos(azimuth), 0.0] > 0.0 else -1.0
 
 
-def _load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
+def _bucket_load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
     """Compute the side view of the soil in a bucket, which fills it up to a level surface.
 
     Args:
@@ -127,11 +127,11 @@ def _load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
     low, high = (full @ up).min(), (full @ up).max()
     for _ in range(_BISECTIONS):
         level = 0.5 * (low + high)
-        low, high = (low, level) if _polygon_area(_cut_above(full, up, level)) > area else (level, high)
-    return _cut_above(full, up, high)
+        low, high = (low, level) if _polygon_area(_keep_polygon_below(full, up, level)) > area else (level, high)
+    return _keep_polygon_below(full, up, high)
 
 
-def _cut_above(polygon: np.ndarray, up: np.ndarray, level: float) -> np.ndarray:
+def _keep_polygon_below(polygon: np.ndarray, up: np.ndarray, level: float) -> np.ndarray:
     """Cut off the part of a polygon (k, 2) above `level` along the unit vector `up`; return the rest."""
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
@@ -154,27 +154,31 @@ def trench_mesh(bed: SoilBed, shape: SoilShape) -> tuple[Mesh, np.ndarray]:
     Returns:
         (mesh in the world frame, (v, 3) colours 0 .. 255).
     """
-    half, cell = 0.5 * bed.bucket.width, bed.radii[1] - bed.radii[0]
-    borders = np.append(bed.radii - 0.5 * cell, bed.radii[-1] + 0.5 * cell)
-    heights = np.interp(borders, bed.radii, shape.surface)
+    half, cell = 0.5 * bed.bucket.width, bed.cell_radii[1] - bed.cell_radii[0]
+    borders = np.append(bed.cell_radii - 0.5 * cell, bed.cell_radii[-1] + 0.5 * cell)
+    heights = np.interp(borders, bed.cell_radii, shape.surface)
     low_r, high_r, low_z, high_z = borders[:-1], borders[1:], heights[:-1], heights[1:]
 
-    def quads(*corners: tuple) -> np.ndarray:
+    def make_cell_triangles(*corners: tuple) -> np.ndarray:
         """Return the triangles of one quadrilateral per cell; corners are (r, side, z) in order."""
         points = [np.stack(np.broadcast_arrays(*corner, low_r)[:3], axis=-1) for corner in corners]
         return np.stack([points[k] for k in (0, 1, 2, 0, 2, 3)], axis=1)
 
-    top = quads((low_r, -half, low_z), (high_r, -half, high_z), (high_r, half, high_z), (low_r, half, low_z))
-    right = quads((low_r, -half, low_z), (low_r, -half, 0.0), (high_r, -half, 0.0), (high_r, -half, high_z))
-    left = quads((low_r, half, low_z), (high_r, half, high_z), (high_r, half, 0.0), (low_r, half, 0.0))
+    top = make_cell_triangles(
+        (low_r, -half, low_z), (high_r, -half, high_z), (high_r, half, high_z), (low_r, half, low_z)
+    )
+    right = make_cell_triangles(
+        (low_r, -half, low_z), (low_r, -half, 0.0), (high_r, -half, 0.0), (high_r, -half, high_z)
+    )
+    left = make_cell_triangles((low_r, half, low_z), (high_r, half, high_z), (high_r, half, 0.0), (low_r, half, 0.0))
     colours = np.where(shape.loose[:, None] > MIN_LOOSE_THICKNESS, LOOSE_COLOUR, BANK_COLOUR)
     triangles = np.concatenate([top, right, left]).reshape(-1, 3, 3)
     c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
-    mesh = flat_triangles(triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+    mesh = make_flat_triangle_mesh(triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
     return mesh, np.repeat(np.concatenate([colours, 0.8 * colours, 0.8 * colours]), 6, axis=0)
 
 
-def load_mesh(history: SoilHistory, row: int) -> Mesh | None:
+def make_bucket_load_mesh(history: SoilHistory, row: int) -> Mesh | None:
     """Create the mesh of the soil in the bucket at a row of the log, in the frame of the bucket's link.
 
     Returns:
@@ -192,10 +196,10 @@ def load_mesh(history: SoilHistory, row: int) -> Mesh | None:
         n = (k + 1) % len(corners)
         triangles += [(near[k], near[n], far[n]), (near[k], far[n], far[k])]
         triangles += [(middle[0], near[n], near[k]), (middle[1], far[k], far[n])]
-    return flat_triangles(np.array(triangles))
+    return make_flat_triangle_mesh(np.array(triangles))
 
 
-def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh, np.ndarray]:
+def make_ground_around_trench(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh, np.ndarray]:
     """Create the mesh of a chequered ground at height 0 with a gap for the strip of soil.
 
     Args:
@@ -206,8 +210,8 @@ def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh
     Returns:
         (mesh in the world frame, (v,) chequerboard colour of each vertex, 0 or 1).
     """
-    half, cell = 0.5 * bed.bucket.width, bed.radii[1] - bed.radii[0]
-    ends = bed.radii[0] - 0.5 * cell, bed.radii[-1] + 0.5 * cell
+    half, cell = 0.5 * bed.bucket.width, bed.cell_radii[1] - bed.cell_radii[0]
+    ends = bed.cell_radii[0] - 0.5 * cell, bed.cell_radii[-1] + 0.5 * cell
     grid = np.arange(-half_size, half_size + 0.5 * tile, tile)
     xs, ys = np.union1d(grid, ends), np.union1d(grid, (-half, half))
     triangles, parity = [], []
@@ -221,7 +225,7 @@ def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh
             parity.append((math.floor(x / tile) + math.floor(y / tile)) % 2)
     c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
     turned = np.array(triangles) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return flat_triangles(turned), np.repeat(parity, 6)
+    return make_flat_triangle_mesh(turned), np.repeat(parity, 6)
 
 
 def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
@@ -239,8 +243,8 @@ def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine)
     bed, shape = history.bed, history.shapes[row]
     c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    half, cell = 0.5 * bed.bucket.width, bed.radii[1] - bed.radii[0]
-    start, end = bed.radii[0] - 0.5 * cell, bed.radii[-1] + 0.5 * cell
+    half, cell = 0.5 * bed.bucket.width, bed.cell_radii[1] - bed.cell_radii[0]
+    start, end = bed.cell_radii[0] - 0.5 * cell, bed.cell_radii[-1] + 0.5 * cell
     bottom = min(0.0, float(bed.surface.min())) - 0.1
     far, aside = _GROUND_HALF_SIZE, 0.5 * (_GROUND_HALF_SIZE - half)
     ground = [
@@ -248,21 +252,25 @@ def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine)
         (start, end, half + aside, aside), (start, end, -half - aside, aside),
     ]  # fmt: skip
 
-    def slab(low_r: float, high_r: float, side: float, width: float, low: float, high: float, colour) -> Marker:
+    def make_slab_marker(
+        low_r: float, high_r: float, side: float, width: float, low: float, high: float, colour
+    ) -> Marker:
         middle = turn @ [0.5 * (low_r + high_r), side, 0.5 * (low + high)]
         sizes = (0.5 * (high_r - low_r), width, 0.5 * (high - low))
-        return box(middle, sizes, (*(colour / 255.0), 1.0), turn)._replace(emission=0.0)
+        return make_box_marker(middle, sizes, (*(colour / 255.0), 1.0), turn)._replace(emission=0.0)
 
-    markers = [slab(low, high, side, width, bottom, 0.0, _GROUND_COLOUR) for low, high, side, width in ground]
-    for r, surface, loose in zip(bed.radii, shape.surface, shape.loose, strict=True):
+    markers = [
+        make_slab_marker(low, high, side, width, bottom, 0.0, _GROUND_COLOUR) for low, high, side, width in ground
+    ]
+    for r, surface, loose in zip(bed.cell_radii, shape.surface, shape.loose, strict=True):
         low, high = r - 0.5 * cell, r + 0.5 * cell
-        markers.append(slab(low, high, 0.0, half, bottom, surface - loose, BANK_COLOUR))
+        markers.append(make_slab_marker(low, high, 0.0, half, bottom, surface - loose, BANK_COLOUR))
         if loose > MIN_LOOSE_THICKNESS:
-            markers.append(slab(low, high, 0.0, half, surface - loose, surface, LOOSE_COLOUR))
-    return markers + _load_markers(history, row, poses, machine)
+            markers.append(make_slab_marker(low, high, 0.0, half, surface - loose, surface, LOOSE_COLOUR))
+    return markers + _make_bucket_load_markers(history, row, poses, machine)
 
 
-def _load_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
+def _make_bucket_load_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
     """Create thin boxes that fill the side view of the soil in the bucket at a row, in the world frame."""
     corners = history.shapes[row].load
     if len(corners) < 3 or machine.arm is None:
@@ -274,9 +282,11 @@ def _load_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine
     half, colour = 0.5 * history.bed.bucket.inner_width, (*(LOOSE_COLOUR / 255.0), 1.0)
     edges, markers = np.linspace(corners[:, 0].min(), corners[:, 0].max(), _LOAD_SLICES + 1), []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
-        column = _cut_above(_cut_above(corners, np.array([1.0, 0.0]), high), np.array([-1.0, 0.0]), -low)
+        column = _keep_polygon_below(
+            _keep_polygon_below(corners, np.array([1.0, 0.0]), high), np.array([-1.0, 0.0]), -low
+        )
         bottom, top = column[:, 1].min(), column[:, 1].max()
         middle = poses.position[row, body] + frame @ [0.5 * (low + high), 0.0, 0.5 * (bottom + top)]
         sizes = (0.5 * (high - low), half, 0.5 * (top - bottom))
-        markers.append(box(middle, sizes, colour, frame)._replace(emission=0.0))
+        markers.append(make_box_marker(middle, sizes, colour, frame)._replace(emission=0.0))
     return markers

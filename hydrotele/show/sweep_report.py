@@ -14,7 +14,7 @@ import numpy as np
 import hydrotele
 from hydrotele.core.output import atomic_file
 from hydrotele.show import report_html
-from hydrotele.show.report_html import png, report_figure
+from hydrotele.show.report_html import figure_to_png, open_report_figure
 
 RUN_COLOUR, MEAN_COLOUR, FAILED_COLOUR = "#9db4c8", "#1769aa", "#b5281c"
 _MAX_COLUMNS, _MAX_MAP_COLUMNS = 4, 3
@@ -75,7 +75,7 @@ def are_numbers(values: Sequence[Any]) -> bool:
     return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
 
 
-def displayed_result(study: Study, name: str) -> DisplayedResult:
+def convert_result_for_display(study: Study, name: str) -> DisplayedResult:
     """Convert a result of all runs to a readable unit: mm if below 2 m, deg, kN from 2 kN."""
     given = study.columns[name]
     values = np.array([math.nan if v is None else float(v) for v in given])
@@ -109,10 +109,10 @@ def draw_main_effects(study: Study) -> bytes:
     keys, across = study.varied_keys, min(_MAX_COLUMNS, len(study.varied_keys))
     per_figure = math.ceil(len(keys) / across)
     rows = per_figure * len(study.figures)
-    with report_figure(0.3 + 2.35 * rows) as figure:
+    with open_report_figure(0.3 + 2.35 * rows) as figure:
         axes = figure.subplots(rows, across, squeeze=False)
         for number, name in enumerate(study.figures):
-            one = displayed_result(study, name)
+            one = convert_result_for_display(study, name)
             block = axes[number * per_figure : (number + 1) * per_figure].ravel()
             for place, key in zip(block, keys, strict=False):
                 _draw_effect(place, study, key, one)
@@ -121,7 +121,7 @@ def draw_main_effects(study: Study) -> bytes:
                 place.set_visible(False)
             for row in axes[number * per_figure : (number + 1) * per_figure]:
                 row[0].set_ylabel(_fold_label(one.label))
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def _draw_effect(place, study: Study, key: str, result: DisplayedResult) -> None:
@@ -139,9 +139,9 @@ def _draw_effect(place, study: Study, key: str, result: DisplayedResult) -> None
     if not are_numbers(steps):
         place.set_xticks(range(len(steps)), [_format_level(step) for step in steps])
         place.set_xlim(-0.5, len(steps) - 0.5)
-    elif key in study.log_sampled or (len(steps) > 2 and _is_wide(spots)):
+    elif key in study.log_sampled or (len(steps) > 2 and _needs_log_scale(spots)):
         place.set_xscale("log")
-    if _is_wide(result.values[known]):
+    if _needs_log_scale(result.values[known]):
         place.set_yscale("log")
     place.set_xlabel(key_label(study, key))
 
@@ -170,11 +170,11 @@ def _mean_curve(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
-def _is_wide(values: np.ndarray) -> bool:
+def _needs_log_scale(values: np.ndarray) -> bool:
     return len(values) > 0 and values.min() > 0.0 and values.max() > _MIN_LOG_SCALE_RATIO * values.min()
 
 
-def map_keys(study: Study) -> tuple[str, str] | None:
+def find_heat_map_keys(study: Study) -> tuple[str, str] | None:
     """Return the two varied grid keys that span a heat map, or None if there are more or fewer."""
     keys = [key for key in study.grid if len(distinct_values(study.columns[key])) > 1]
     return (keys[0], keys[1]) if len(keys) == 2 else None
@@ -195,14 +195,14 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
         math.ceil(len(study.figures) / _MAX_MAP_COLUMNS),
         min(_MAX_MAP_COLUMNS, len(study.figures)),
     )
-    with report_figure(rows * min(max(2.6, 0.9 + 0.32 * len(down)), 6.0)) as figure:
+    with open_report_figure(rows * min(max(2.6, 0.9 + 0.32 * len(down)), 6.0)) as figure:
         axes = figure.subplots(rows, across, squeeze=False)
         for place, name in zip(axes.ravel(), study.figures, strict=False):
-            one = displayed_result(study, name)
-            cells = _cells(study, keys, one.values)
+            one = convert_result_for_display(study, name)
+            cells = _average_into_cells(study, keys, one.values)
             place.grid(False)
             place.set_facecolor("0.85")
-            scale = "log" if _is_wide(cells[np.isfinite(cells)]) else "linear"
+            scale = "log" if _needs_log_scale(cells[np.isfinite(cells)]) else "linear"
             image = place.imshow(cells, aspect="auto", origin="lower", cmap="viridis", norm=scale)
             figure.colorbar(image, ax=place, pad=0.02)
             place.set_title(_fold_label(one.label))
@@ -214,10 +214,10 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
                 _print_cell_values(place, cells, image)
         for place in axes.ravel()[len(study.figures) :]:
             place.set_visible(False)
-        return png(figure)
+        return figure_to_png(figure)
 
 
-def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
+def _average_into_cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
     """Average the values (n,) of n runs over the cells that two keys span.
 
     Returns:
@@ -274,9 +274,9 @@ def write_sweep_report(study: Study, folder: Path) -> None:
         InputError: the folder cannot be written.
     """
     images = {}
-    if any(np.isfinite(displayed_result(study, name).values).any() for name in study.figures):
+    if any(np.isfinite(convert_result_for_display(study, name).values).any() for name in study.figures):
         images["main_effects.png"] = draw_main_effects(study)
-        if keys := map_keys(study):
+        if keys := find_heat_map_keys(study):
             images["heat_map.png"] = draw_heat_maps(study, keys)
     for name in ("main_effects.png", "heat_map.png"):
         if name in images:
@@ -290,7 +290,7 @@ def write_sweep_report(study: Study, folder: Path) -> None:
 
 def _write_page(study: Study, images: dict[str, bytes], path: Path) -> None:
     runs, failed = len(study.columns["run"]), len(study.failed)
-    report_html.write_report(
+    report_html.write_template_report(
         "sweep", path, title=f"sweep {study.name}", heading=study.name.replace("_", " "),
         over=f"hydrotele {hydrotele.__version__} - sweep of {study.scenario}",
         description=study.description, varied=_key_rows(study), spreads=_range_rows(study),
@@ -326,19 +326,19 @@ def _format_value(value) -> str:
 def _range_rows(study: Study) -> list[dict[str, Any]]:
     rows = []
     for name in study.figures:
-        one = displayed_result(study, name)
+        one = convert_result_for_display(study, name)
         known = np.flatnonzero(np.isfinite(one.values))
         if not len(known):
             continue
         values = one.values[known]
         ends = [int(known[np.argmin(values)]), int(known[np.argmax(values)])]
-        smallest, largest = (_run(study, one.values[row], row) for row in ends)
+        smallest, largest = (_describe_run(study, one.values[row], row) for row in ends)
         median = f"{np.median(values):.4g}"
         rows.append({"label": one.label, "smallest": smallest, "median": median, "largest": largest})
     return rows
 
 
-def _run(study: Study, value: float, row: int) -> tuple[str, str]:
+def _describe_run(study: Study, value: float, row: int) -> tuple[str, str]:
     """Format a result and the run it belongs to, with the first three varied keys of that run.
 
     Args:

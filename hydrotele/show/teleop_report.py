@@ -13,18 +13,18 @@ import numpy as np
 
 import hydrotele
 from hydrotele.show import report_html
-from hydrotele.show.report_html import png, report_figure
+from hydrotele.show.report_html import figure_to_png, open_report_figure
 from hydrotele.teleop.analysis import stability_map
 from hydrotele.teleop.findings import (
     ScenarioFindings,
     TeleopFindings,
     describe_stability,
     format_delay,
-    format_error,
-    format_factor,
+    format_gain_margin,
     format_number,
+    format_relative_error,
 )
-from hydrotele.teleop.switching import StiffnessAxis, growth_map
+from hydrotele.teleop.switching import StiffnessAxis, compute_switching_growth_map
 from hydrotele.teleop.two_port import Impedance
 
 _INK, _GREY_COLOUR = "#262b33", "#8a94a0"
@@ -62,7 +62,7 @@ def draw_hybrid_matrix(found: TeleopFindings) -> bytes:
     Returns:
         A PNG.
     """
-    with report_figure(6.2) as figure:
+    with open_report_figure(6.2) as figure:
         axes = figure.subplots(2, 2, sharex=True)
         for row in range(2):
             for column in range(2):
@@ -71,12 +71,12 @@ def draw_hybrid_matrix(found: TeleopFindings) -> bytes:
                 if row != column:
                     panel.axhline(1.0, color=_GREY_COLOUR, lw=1.2, dashes=(1, 1.5))
                 for one in found.analyses:
-                    _plot_line(panel, one, np.abs(one.hybrid_matrices[:, row, column]))
+                    _plot_over_frequency(panel, one, np.abs(one.hybrid_matrices[:, row, column]))
                 _set_log_axes(panel, 1e-4, 1e5)
         for panel in axes[1]:
             panel.set_xlabel("frequency [Hz]")
         _legend(figure, axes[0, 0])
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
@@ -84,15 +84,15 @@ def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
 
     The panels are magnitude and phase, with one curve per structure.
     """
-    with report_figure(4.2) as figure:
+    with open_report_figure(4.2) as figure:
         left, right = figure.subplots(1, 2, sharex=True)
         first = found.analyses[0]
         hertz = first.frequencies / (2.0 * np.pi)
         left.plot(hertz, np.abs(first.task_impedance), color=_INK, lw=4.0, alpha=0.25, label="task")
         right.plot(hertz, np.degrees(np.angle(first.task_impedance)), color=_INK, lw=4.0, alpha=0.25)
         for one in found.analyses:
-            _plot_line(left, one, np.abs(one.transmitted_impedance))
-            _plot_line(right, one, np.degrees(np.unwrap(np.angle(one.transmitted_impedance))))
+            _plot_over_frequency(left, one, np.abs(one.transmitted_impedance))
+            _plot_over_frequency(right, one, np.degrees(np.unwrap(np.angle(one.transmitted_impedance))))
         _set_log_axes(left, 1e-1, 1e7)
         left.set_title("magnitude of the felt impedance [N s/m]")
         right.set_title("phase of the felt impedance [deg]")
@@ -101,7 +101,7 @@ def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
         for panel in (left, right):
             panel.set_xlabel("frequency [Hz]")
         _legend(figure, left)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_scattering(found: TeleopFindings) -> bytes:
@@ -109,20 +109,20 @@ def draw_scattering(found: TeleopFindings) -> bytes:
 
     Above 1, the teleoperator is not passive: it can emit energy.
     """
-    with report_figure(3.4) as figure:
+    with open_report_figure(3.4) as figure:
         panel = figure.subplots()
         top = max(float(one.scattering_norms.max()) for one in found.analyses)
         panel.axhspan(1.0, 1.3 * top, color=_UNSTABLE_COLOUR, alpha=0.5, lw=0)
         panel.axhline(1.0, color=_INK, lw=1.0)
         for one in found.analyses:
-            _plot_line(panel, one, one.scattering_norms)
+            _plot_over_frequency(panel, one, one.scattering_norms)
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.set_ylim(0.8, 1.3 * top)
         panel.set_xlabel("frequency [Hz]")
         panel.set_title("norm of the scattering matrix [1]; above 1 (red) it is not passive")
         _legend(figure, panel)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_nyquist(found: TeleopFindings) -> bytes:
@@ -130,7 +130,7 @@ def draw_nyquist(found: TeleopFindings) -> bytes:
 
     There is one panel per structure.
     """
-    with report_figure(3.1 * _rows(found)) as figure:
+    with open_report_figure(3.1 * _count_panel_rows(found)) as figure:
         for panel, one in zip(_panels(figure, found), found.analyses, strict=False):
             colour = _LINE_STYLES[one.structure][0]
             for curve, look, name in (
@@ -146,7 +146,7 @@ def draw_nyquist(found: TeleopFindings) -> bytes:
             said = "stable" if one.is_stable_held else describe_stability(one).removeprefix("no, ")
             panel.set_title(f"{display_name(one.structure)}: {said}")
             panel.legend(loc="upper right", fontsize=8, frameon=False)
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def draw_stability_maps(found: TeleopFindings) -> bytes:
@@ -154,10 +154,10 @@ def draw_stability_maps(found: TeleopFindings) -> bytes:
 
     Crosses mark cells in which a simulation disagrees.
     """
-    with report_figure(2.9 * _rows(found)) as figure:
+    with open_report_figure(2.9 * _count_panel_rows(found)) as figure:
         seen = {one.structure: one.simulated for one in found.agreements}
         for panel, (name, cells) in zip(_panels(figure, found), found.maps.items(), strict=False):
-            _cells(panel, 1e3 * found.delays, found.factors, cells, (_UNSTABLE_COLOUR, _STABLE_COLOUR))
+            _draw_cell_map(panel, 1e3 * found.delays, found.factors, cells, (_UNSTABLE_COLOUR, _STABLE_COLOUR))
             panel.set_yscale("log")
             _set_root_scale(panel, 1e3 * found.delays)
             panel.plot(1e3 * found.case.delay, 1.0, "o", color=_INK, ms=6, clip_on=False)
@@ -169,10 +169,10 @@ def draw_stability_maps(found: TeleopFindings) -> bytes:
             panel.set_ylabel("factor on reflection [1]")
             panel.grid(False)
         _draw_map_legend(figure)
-        return png(figure)
+        return figure_to_png(figure)
 
 
-def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
+def draw_stiffness_stability(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
     """Draw the stability of a joystick with force-dependent stiffness over damping and maximum stiffness.
 
     The left panel is the margin B^2 - 4 M K_max, the right one the stability by this margin or under
@@ -185,15 +185,15 @@ def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
     Returns:
         A PNG.
     """
-    damping = np.linspace(0.0, 1.25 * max(held.theorem_damping, held.damping), 91)
+    damping = np.linspace(0.0, 1.25 * max(held.stability_theorem_damping, held.damping), 91)
     stiffest = np.geomspace(held.min_stiffness or 1e-2 * held.max_stiffness, 4.0 * held.max_stiffness, 91)
-    growth = growth_map(held.mass, held.min_stiffness, damping, stiffest)
+    growth = compute_switching_growth_map(held.mass, held.min_stiffness, damping, stiffest)
     margin = damping[None, :] ** 2 - 4.0 * held.mass * stiffest[:, None]
-    with report_figure(4.0) as figure:
+    with open_report_figure(4.0) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         _draw_margin(figure, left, damping, stiffest, margin)
         kinds = np.where(margin > 0.0, 2, np.where(growth < 1.0, 1, 0))
-        _cells(
+        _draw_cell_map(
             right,
             damping,
             stiffest,
@@ -211,7 +211,7 @@ def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
             panel.set_ylim(stiffest[0], stiffest[-1])
             panel.grid(False)
         left.set_ylabel("maximum stiffness K_max [N/m]")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def _draw_margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
@@ -230,7 +230,7 @@ def _draw_margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndar
     panel.set_title("margin B² - 4 M K [1000 (N s/m)²]")
 
 
-def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours: tuple) -> None:
+def _draw_cell_map(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours: tuple) -> None:
     """Draw a map of cells over x (n,) and y (m,); the integer `kinds` (m, n) select the colours."""
     from matplotlib.colors import ListedColormap
 
@@ -248,7 +248,7 @@ def _set_root_scale(panel: Any, delays: np.ndarray) -> None:
     panel.set_xticks(ticks, [str(tick) for tick in ticks])
 
 
-def _plot_line(panel: Any, one: Any, values: np.ndarray) -> None:
+def _plot_over_frequency(panel: Any, one: Any, values: np.ndarray) -> None:
     colour, style = _LINE_STYLES[one.structure]
     hertz = one.frequencies / (2.0 * np.pi)
     panel.plot(hertz, values, color=colour, ls=style, lw=1.4, label=display_name(one.structure))
@@ -279,13 +279,13 @@ def _draw_map_legend(figure: Any) -> None:
     )  # fmt: skip
 
 
-def _rows(found: TeleopFindings) -> int:
+def _count_panel_rows(found: TeleopFindings) -> int:
     return -(-len(found.analyses) // 3)
 
 
 def _panels(figure: Any, found: TeleopFindings) -> list:
     """Create one panel per structure, three per row; hide unused panels."""
-    panels = list(figure.subplots(_rows(found), 3, squeeze=False).flat)
+    panels = list(figure.subplots(_count_panel_rows(found), 3, squeeze=False).flat)
     for panel in panels[len(found.analyses) :]:
         panel.set_axis_off()
     return panels[: len(found.analyses)]
@@ -312,26 +312,26 @@ def write_teleop_report(found: TeleopFindings, maps: bytes, path: str | Path) ->
     spring, case = found.spring, found.case
     good, many = [one for one in found.analyses if one.is_stable_held], len(found.analyses)
     gains, names = case.gains, ", ".join(display_name(one.structure) for one in good)
-    report_html.write_report(
+    report_html.write_template_report(
         "two_port", path, title=f"{found.name}: teleoperator",
         over=f"TELEOPERATOR ANALYSIS  ·  {found.name}  ·  delay {1e3 * case.delay_forward:g} ms"
         f" forward, {1e3 * case.delay_back:g} ms back",
         heading=f"Stable: {names}" if good else "No structure is stable",
         chip=("no_gap", "All stable") if len(good) == many
         else ("ambiguous", "Some unstable") if good else ("unknown", "Unstable"),
-        figures=_figures(found), verdicts=_verdicts(found), confirmed=_confirmation_rows(found),
+        figures=_key_figure_cards(found), verdicts=_verdicts(found), confirmed=_simulation_agreement_rows(found),
         pictures={
             "maps": maps, "nyquist": draw_nyquist(found), "felt": draw_transmitted_impedance(found),
             "scattering": draw_scattering(found), "hybrid": draw_hybrid_matrix(found),
         },
-        stiffness=_stiffness(spring, spring.with_hand(case.hand)) if spring else None,
+        stiffness=_stiffness_content(spring, spring.with_hand(case.hand)) if spring else None,
         gains=f"position {gains.position:g}, velocity {gains.velocity:g} 1/s, force"
         f" {gains.force:g}",
         impedances=_impedances(found), version=hydrotele.__version__,
     )  # fmt: skip
 
 
-def _figures(found: TeleopFindings) -> list[tuple[str, str, str]]:
+def _key_figure_cards(found: TeleopFindings) -> list[tuple[str, str, str]]:
     many, good = len(found.analyses), sum(one.is_stable_held for one in found.analyses)
     passive = sum(one.has_passive_port for one in found.analyses)
     cards = [
@@ -354,38 +354,39 @@ def _verdicts(found: TeleopFindings) -> list[dict[str, Any]]:
         {
             "name": display_name(one.structure), "channels": _CHANNELS[one.structure],
             "stable": one.is_stable_held, "why": describe_stability(one), "passive": one.has_passive_port,
-            "texts": (format_factor(one.gain_margin), format_delay(one.max_delay),
+            "texts": (format_gain_margin(one.gain_margin), format_delay(one.max_delay),
                       f"{one.scattering_norms.max():.3g}"),
         }
         for one in found.analyses
     ]  # fmt: skip
 
 
-def _confirmation_rows(found: TeleopFindings) -> list[tuple[str, ...]]:
+def _simulation_agreement_rows(found: TeleopFindings) -> list[tuple[str, ...]]:
     rows = []
     for one in found.agreements:
-        errors = [format_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
+        errors = [format_relative_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
         cells = f"{int((one.predicted == one.simulated).sum())} of {one.simulated.size}"
         rows.append((display_name(one.structure), *[*errors, "-"][:2], cells))
     return rows
 
 
-def _stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> dict[str, Any]:
+def _stiffness_content(spring: StiffnessAxis, held: StiffnessAxis) -> dict[str, Any]:
     rows = [
         (name, f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.min_stiffness:g} to {one.max_stiffness:g}",
-         format_number(one.theorem_margin), f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}")
+         format_number(one.stability_theorem_margin), f"{one.stability_theorem_damping:.4g}",
+         f"{one.half_swing_growth:.3g}")
         for name, one in (("held", held), ("released", spring))
     ]  # fmt: skip
     safe = held.half_swing_growth < 1.0
     conclusion = (
         "The margin of the held joystick is positive: no change of the stiffness makes it unstable."
-        if held.theorem_margin > 0.0
+        if held.stability_theorem_margin > 0.0
         else "The margin of the held joystick is not positive, so that the theorem does not decide"
         " its stability. Under the worst-case switching of the stiffness, each half oscillation"
         f" {'shrinks' if safe else 'grows'} to {held.half_swing_growth:.3g} times the previous one: the"
         f" joystick is {'stable' if safe else 'unstable'}."
     )
-    return {"rows": rows, "conclusion": conclusion, "picture": draw_stiffness(spring, held)}
+    return {"rows": rows, "conclusion": conclusion, "picture": draw_stiffness_stability(spring, held)}
 
 
 def _impedances(found: TeleopFindings) -> list[tuple[str, ...]]:
@@ -419,7 +420,7 @@ def draw_loop_map(found: ScenarioFindings) -> bytes:
     delays = _MAX_DELAY * np.linspace(0.0, 1.0, _N_DELAYS)
     factors = margin * np.geomspace(*_RATIO_RANGE, _N_FACTORS)
     good = stability_map(case, loop.structure, delays, factors)
-    with report_figure(3.4) as figure:
+    with open_report_figure(3.4) as figure:
         axes = figure.subplots()
         axes.pcolormesh(
             1e3 * delays, factors * case.ratio * case.force_limit, good, cmap="Blues", vmin=-0.3,
@@ -431,7 +432,7 @@ def draw_loop_map(found: ScenarioFindings) -> bytes:
         axes.set_xlabel("one-way delay [ms]")
         axes.set_ylabel(f"hand force at {case.force_limit / 1e3:g} kN [N]")
         axes.set_title(f"{loop.structure}; blue: stable, point: scenario")
-        return png(figure)
+        return figure_to_png(figure)
 
 
 def write_loop_report(
@@ -449,11 +450,12 @@ def write_loop_report(
         path: file to write.
     """
     springs = [
-        (name, f"{one.damping:g}", f"{one.max_stiffness:g}", format_number(one.theorem_margin),
-         f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}")
+        (name, f"{one.damping:g}", f"{one.max_stiffness:g}", format_number(one.stability_theorem_margin),
+         f"{one.stability_theorem_damping:.4g}",
+         f"{one.half_swing_growth:.3g}")
         for name, one in (("held", found.held_spring), ("released", found.released_spring))
     ]  # fmt: skip
-    report_html.write_report(
+    report_html.write_template_report(
         "loop", path, title=f"{found.name}: loop", over=f"TELEOPERATED SCENARIO  ·  {found.name}",
         heading=f"{'Stable' if found.loop.is_stable else 'Unstable'}: {found.loop.structure}",
         findings=findings_rows, map=map_png, springs=springs,

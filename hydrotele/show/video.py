@@ -15,12 +15,12 @@ from hydrotele.scenario.scenario import SoilGround
 from hydrotele.show.canvas import Canvas
 from hydrotele.show.pose import (
     compile_visual_model,
-    logged_joints,
-    logged_positions,
+    compute_joint_positions,
+    extract_joint_motion,
     logged_surroundings,
     poses_at_positions,
 )
-from hydrotele.show.recording import tip_path, view_of_machine
+from hydrotele.show.recording import compute_machine_camera, compute_tip_path
 from hydrotele.show.soil import soil_history, soil_markers
 from hydrotele.simulate.mechanism import GROUND_NAME
 
@@ -51,13 +51,13 @@ def write_video(
         raise InputError("the video", message) from None
     things = logged_surroundings(log)
     model = compile_visual_model(machine, surroundings=things)
-    rows = logged_positions(machine, model, logged_joints(machine, log), log)
+    rows = compute_joint_positions(machine, model, extract_joint_motion(machine, log), log)
     poses = poses_at_positions(model, rows)
     soil = None
     if grounds := [thing for thing in things if isinstance(thing, SoilGround)]:
         soil = soil_history(machine, grounds[0], log, poses)
         model.geom(GROUND_NAME).rgba[3] = 0.0  # the plane would cover the trench
-    camera, data = _make_camera(model, tip_path(machine, log, poses)), mujoco.MjData(model)
+    camera, data = _make_camera(model, compute_tip_path(machine, log, poses)), mujoco.MjData(model)
     begin, end = float(log.time[0]), float(log.time[-1])
     times = np.arange(begin, end, 1.0 / _FRAME_RATE)
     canvas = Canvas(model, *size)
@@ -82,7 +82,7 @@ def write_video(
 
 def _make_camera(model: mujoco.MjModel, tip: np.ndarray | None) -> mujoco.MjvCamera:
     """Return a camera that shows the machine and the whole path of its tip."""
-    eye, target = view_of_machine(model, tip)
+    eye, target = compute_machine_camera(model, tip)
     ahead = target - eye
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance = target, float(np.linalg.norm(ahead))

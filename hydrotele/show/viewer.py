@@ -63,7 +63,7 @@ def find_rerun_program() -> Path:
     return program
 
 
-def find_recording(path: str | os.PathLike) -> Path:
+def resolve_recording_path(path: str | os.PathLike) -> Path:
     """Return the absolute path of an existing recording.
 
     Raises:
@@ -114,7 +114,7 @@ def run_rerun(arguments: Sequence[str], uses_temporary_home: bool = False) -> It
         try:
             yield Viewer(process, output)
         finally:
-            _end(process)
+            _end_process_group(process)
 
 
 def _parent_death_hook() -> Callable[[], object] | None:
@@ -128,17 +128,17 @@ def _parent_death_hook() -> Callable[[], object] | None:
     return lambda: prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
-def _end(process: subprocess.Popen) -> None:
-    _signal(process, signal.SIGTERM)
+def _end_process_group(process: subprocess.Popen) -> None:
+    _signal_process_group(process, signal.SIGTERM)
     try:
         process.wait(_EXIT_TIMEOUT)
     except subprocess.TimeoutExpired:
         pass
-    _signal(process, getattr(signal, "SIGKILL", signal.SIGTERM))
+    _signal_process_group(process, getattr(signal, "SIGKILL", signal.SIGTERM))
     process.wait(_EXIT_TIMEOUT)
 
 
-def _signal(process: subprocess.Popen, number: int) -> None:
+def _signal_process_group(process: subprocess.Popen, number: int) -> None:
     """Send a signal to the whole process group, which can outlive its leader."""
     if sys.platform == "win32":
         process.terminate()
@@ -151,7 +151,7 @@ _POLL = 0.1  # s
 
 
 @contextlib.contextmanager
-def web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0) -> Iterator[str]:
+def serve_web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0) -> Iterator[str]:
     """Serve a recording and rerun's web viewer by HTTP on this computer during the context.
 
     Args:
@@ -165,7 +165,7 @@ def web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float =
     Raises:
         InputError: the recording is missing, the port is in use, or the server does not start.
     """
-    rrd = find_recording(rrd)
+    rrd = resolve_recording_path(rrd)
     data_port, port = find_free_port(), port or find_free_port()
     arguments = ["--serve-web", "--bind", "127.0.0.1", "--port", str(data_port)]
     arguments += ["--web-viewer-port", str(port), str(rrd)]
@@ -193,7 +193,7 @@ def serve_recording(
     Raises:
         InputError: the recording is missing, the port is in use, or the server does not start.
     """
-    with web_viewer(rrd, port) as url, contextlib.suppress(KeyboardInterrupt):
+    with serve_web_viewer(rrd, port) as url, contextlib.suppress(KeyboardInterrupt):
         report_url(url)
         while True:
             time.sleep(1.0)
@@ -208,7 +208,7 @@ def open_viewer(rrd: str | os.PathLike) -> int:
     Raises:
         InputError: the recording is missing or there is no viewer.
     """
-    with run_rerun([str(find_recording(rrd))]) as viewer:
+    with run_rerun([str(resolve_recording_path(rrd))]) as viewer:
         return viewer.process.wait()
 
 
@@ -289,7 +289,7 @@ def _run_headless_viewer(
     Yields:
         Client and state of the viewer.
     """
-    rrd, port = find_recording(rrd), find_free_port()
+    rrd, port = resolve_recording_path(rrd), find_free_port()
     arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port)]
     arguments += ["--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", str(rrd)]
     with run_rerun(arguments, uses_temporary_home=True) as viewer:
@@ -299,7 +299,7 @@ def _run_headless_viewer(
         except (RuntimeError, ConnectionError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 viewer.process.wait(_ERROR_TIMEOUT)
-            _check(viewer, rrd, deadline)
+            _check_viewer_alive(viewer, rrd, deadline)
             raise InputError(rrd, f"the viewer does not answer: {error}") from error
 
 
@@ -307,7 +307,7 @@ def _connect_client(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "V
     from rerun.experimental import ViewerClient
 
     while True:
-        _check(viewer, rrd, deadline)
+        _check_viewer_alive(viewer, rrd, deadline)
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
@@ -318,7 +318,7 @@ def _connect_client(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "V
 
 def _wait_until_loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) -> "ViewerState":
     while True:
-        _check(viewer, rrd, deadline)
+        _check_viewer_alive(viewer, rrd, deadline)
         state = client.get_state()
         if not state.loading and state.recordings and state.recordings[0].timelines:
             return state
@@ -327,7 +327,7 @@ def _wait_until_loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadli
         time.sleep(_POLL)
 
 
-def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
+def _check_viewer_alive(viewer: Viewer, rrd: Path, deadline: float) -> None:
     """Raise InputError if the viewer has ended or the deadline has passed."""
     if viewer.process.poll() is not None:
         said = viewer.read_output()

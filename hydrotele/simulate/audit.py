@@ -10,12 +10,12 @@ from mujoco import rollout
 
 from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
-from hydrotele.hydraulics.laws import air_compliance, port_flow, pressure_without_air
-from hydrotele.hydraulics.pump import oil_compliance, speed_after_switching
+from hydrotele.hydraulics.laws import air_compliance, pressure_without_released_air, relief_and_makeup_flow
+from hydrotele.hydraulics.pump import chamber_compliance, pump_speed_after_switching
 from hydrotele.simulate.closure import count_pins
 from hydrotele.simulate.mechanism import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant, evaluate_terms
-from hydrotele.simulate.record import align_positions, drive_motion, state_flows
+from hydrotele.simulate.record import align_staggered_positions, compute_state_flows_and_forces, extract_drive_motion
 
 _CONTACT_CHECK_INTERVAL = 10  # steps between two contact checks: a contact lasts longer
 _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -50,19 +50,19 @@ def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray
     at = np.cumsum([1, model.nq, model.nv, model.na])
     qpos, qvel, act = states[:, 1 : at[1]], states[:, at[1] : at[2]], states[:, at[2] : at[3]]
     dt = model.opt.timestep
-    qpos = align_positions(model, qpos[1:], qvel[1:])  # states at equal times, see record.py
+    qpos = align_staggered_positions(model, qpos[1:], qvel[1:])  # states at equal times, see record.py
     qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
-    x, v = drive_motion(plant, qpos, qvel)
+    x, v = extract_drive_motion(plant, qpos, qvel)
     more = evaluate_terms(plant.machine, states[1:, 0], act, x, v, controls)
-    work, flow = _hydraulic_balance(plant, x, v, act, more, dt)
+    work, flow = _compute_work_and_volume_error(plant, x, v, act, more, dt)
     return {
         "seconds": len(controls) * dt,
         "flow_balance": flow,
-        "energy_balance": _energy_balance(plant, qpos, qvel, work, dt),
+        "energy_balance": _compute_energy_balance_error(plant, qpos, qvel, work, dt),
     }
 
 
-def _hydraulic_balance(plant, x, v, act, more, dt):
+def _compute_work_and_volume_error(plant, x, v, act, more, dt):
     """Compute the work of the hydraulic drives and the largest volume balance error of any chamber.
 
     `more` (n, nu, 3) are the forces and flows of terms, as `evaluate_terms` returns them.
@@ -73,7 +73,7 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
     user, count = plant.model.actuator_user, plant.hydraulic
     if not count:
         return np.zeros(len(x)), None
-    table = state_flows(user.ravel(), count, np.ascontiguousarray(act), x, v)
+    table = compute_state_flows_and_forces(user.ravel(), count, np.ascontiguousarray(act), x, v)
     worst = 0.0
     power = np.zeros(len(x))
     for i in range(count):
@@ -85,17 +85,17 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
 def _volume_errors(plant, i, table, act, x, v, more, dt):
     """Yield the relative oil volume balance error [1] of the head and the rod chamber of axis i.
 
-    `table` has the flows of `state_flows`, and `more` the forces and flows of terms.
+    `table` has the flows of `compute_state_flows_and_forces`, and `more` the forces and flows of terms.
     """
     axis = plant.machine.axes[plant.axes[i]]
     if axis.pump:
         began = _flows_after_switching(plant, i, act, x, v)
-        yield from _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt)
+        yield from _compute_pump_axis_volume_errors(axis, i, table, began, act, x, v, more, dt)
         return
     valve, supply = axis.valve, plant.machine.supply
     drive = axis.hydraulic_drive
-    head, rod = drive.areas
-    volume_head, volume_rod = drive.volumes(x[:, i])
+    head, rod = drive.effective_areas
+    volume_head, volume_rod = drive.chamber_volumes(x[:, i])
     p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
     leak = drive.leakage * (p_head - p_rod)
     release = supply.dissolved_air * supply.bulk_modulus
@@ -104,7 +104,7 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
         (p_rod, table[:, 2 + 3 * i] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
     )
     for pressure, inflow, swept, volume in sides:
-        port, bubbles, oil = _chamber_laws(
+        port, bubbles, oil = _compute_port_flows_and_air(
             pressure, valve.port_relief, valve.port_relief_gain, supply.tank_pressure,
             valve.makeup_gain, supply.entrained_air, release,
         )  # fmt: skip
@@ -118,7 +118,7 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
 
 
 @compiled
-def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
+def _compute_port_flows_and_air(pressure, relief, gain, tank, makeup, air, release):
     """Compute relief, make-up and air quantities of one chamber from its pressures (n,) [Pa].
 
     Returns:
@@ -128,34 +128,34 @@ def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
     n = len(pressure)
     port, bubbles, oil = np.empty(n), np.empty(n - 1), np.empty(n)
     for row in range(n):
-        port[row] = port_flow(pressure[row], relief, gain, tank, makeup)[0]
-        oil[row] = pressure_without_air(pressure[row], release)
+        port[row] = relief_and_makeup_flow(pressure[row], relief, gain, tank, makeup)[0]
+        oil[row] = pressure_without_released_air(pressure[row], release)
     for row in range(n - 1):
         bubbles[row] = air_compliance(0.5 * (pressure[row] + pressure[row + 1]), air)
     return port, bubbles, oil
 
 
 def _flows_after_switching(plant, i, act, x, v):
-    """Return the result of `state_flows` at the start of every step, with the valve of axis i switched.
+    """Return the result of `compute_state_flows_and_forces` at the start of every step; axis i is switched.
 
     The axis has its own pump. Its valve switches at the start of a step, while the pump keeps its speed.
     """
     switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
     switched[:-1, a] = [
-        speed_after_switching(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
+        pump_speed_after_switching(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
     ]
-    return state_flows(plant.model.actuator_user.ravel(), plant.hydraulic, switched, x, v)
+    return compute_state_flows_and_forces(plant.model.actuator_user.ravel(), plant.hydraulic, switched, x, v)
 
 
-def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
+def _compute_pump_axis_volume_errors(axis, i, table, began, act, x, v, more, dt):
     """Yield the relative volume balance error [1] of both chambers of an axis with its own pump.
 
-    `table` has the flows of `state_flows` at the end of every step, and `began` those at its start.
+    `table` has the flows of `compute_state_flows_and_forces` at the end of every step, and `began` those at its start.
     """
     cylinder, pump = axis.cylinder, axis.pump
     p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
     leak = cylinder.leakage * (p_head - p_rod)
-    head, rod = cylinder.volumes(x[:, i])
+    head, rod = cylinder.chamber_volumes(x[:, i])
     sides = (
         (p_head, 1, more[:, i, 1] - leak, cylinder.area_head * v[:, i], head,
          pump.compliance_head, pump.air_head),
@@ -166,7 +166,7 @@ def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
         inflow, first = (t[:, column + 3 * i] + besides for t in (table, began))
         entered = np.sum(0.5 * dt * ((inflow - swept)[1:] + (first - swept)[:-1]))
         soft = np.array([
-            oil_compliance(each, pump.bulk_modulus, walls, air, p)
+            chamber_compliance(each, pump.bulk_modulus, walls, air, p)
             for each, p in zip(volume, pressure, strict=True)
         ])  # fmt: skip
         compressed = np.sum(0.5 * (soft[1:] + soft[:-1]) * np.diff(pressure))
@@ -174,7 +174,7 @@ def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
         yield abs(entered - compressed) / max(through, 1e-12)
 
 
-def _energy_balance(plant, qpos, qvel, work, dt):
+def _compute_energy_balance_error(plant, qpos, qvel, work, dt):
     """Compute |work of the drives - damping losses - change of mechanical energy| per work of the drives [1].
 
     Returns None if a contact or joint limit was active, or if a drive is not hydraulic or did no work.

@@ -22,10 +22,10 @@ from hydrotele.multibody.closures import close_loops_from
 from hydrotele.simulate.mechanism import (
     assemble_mjcf,
     drive_and_load_dofs,
-    lock_drives,
     mjcf_document,
-    pin_site,
-    tilt_joint,
+    pin_site_name,
+    set_drives_to_load_positions,
+    tilt_joint_name,
 )
 
 _MAX_JOINT_STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
@@ -38,11 +38,11 @@ def dependent_joints(machine: Machine) -> tuple[str, ...]:
     """Return the names of the joints whose positions follow from the loops: tubes, rods and undriven links."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
-    tilts = [tilt_joint(name) for name in cylinders if has_ball_ends(machine, name)]
-    return (*bars, *tilts, *loops.dependent_joints(machine))
+    tilts = [tilt_joint_name(name) for name in cylinders if has_ball_ends(machine, name)]
+    return (*bars, *tilts, *loops.find_dependent_joints(machine))
 
 
-def loop_shaping_joints(machine: Machine) -> list[str]:
+def independent_loop_joints(machine: Machine) -> list[str]:
     """Return the names of the independent joints that change the shape of a loop.
 
     These are the joints that a cylinder moves and those within a closure. The joint of a saw, for
@@ -51,7 +51,7 @@ def loop_shaping_joints(machine: Machine) -> list[str]:
     following = dependent_joints(machine)
     joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
     for closure in machine.closures.values():
-        for link in loops.loop_links(machine, closure.a.link, closure.b.link):
+        for link in loops.find_links_between(machine, closure.a.link, closure.b.link):
             joint = machine.links[link].joint
             joints += [joint.name] if joint else []
     return [name for name in dict.fromkeys(joints) if name not in following]
@@ -62,7 +62,7 @@ def count_pins(model: mujoco.MjModel) -> int:
     return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
 
 
-def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+def compute_loop_closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Return the largest loop closure error: the distance between the two halves of a pin [m].
 
     The positions are those of `data.site_xpos`, which are not recomputed.
@@ -158,7 +158,7 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
     data.qpos[:] = model.qpos0
     for name in following:
         data.qpos[model.joint(name).qposadr[0]] = machine.home.get(name, 0.0)
-    shaping = np.isin(names, loop_shaping_joints(machine))
+    shaping = np.isin(names, independent_loop_joints(machine))
     parts = 1 + int(np.max(np.abs(goal - home)[shaping], initial=0.0) / _MAX_JOINT_STEP)
     for part in range(parts + 1):
         data.qpos[places] = home + (goal - home) * part / parts
@@ -167,13 +167,13 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
         if not _solve_closure(linkage, data, _CLOSED_TOLERANCE):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
             raise InputError(f"machine {machine.name}", f"the linkages do not close at {where}")
-    lock_drives(machine, model, data)
+    set_drives_to_load_positions(machine, model, data)
 
 
-def _solve_closure(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
+def _solve_closure(linkage: _Linkage, data: mujoco.MjData, tolerance: float) -> bool:
     """Close all loops by moving the dependent joints from their positions in `data.qpos`.
 
-    Also updates the positions of bodies and sites in `data`. `closed` is the pin distance at which
+    Also updates the positions of bodies and sites in `data`. `tolerance` is the pin distance at which
     Newton's method stops [m].
 
     Returns:
@@ -183,11 +183,11 @@ def _solve_closure(linkage: _Linkage, data: mujoco.MjData, closed: float) -> boo
     if not len(following):
         return True
     q = data.qpos[chain.qpos_indices]
-    left = close_loops_from(chain.tree, q, following, closed, _MAX_NEWTON_STEP)
+    left = close_loops_from(chain.tree, q, following, tolerance, _MAX_NEWTON_STEP)
     data.qpos[chain.qpos_indices] = q
     mujoco.mj_kinematics(linkage.model, data)
     mujoco.mj_comPos(linkage.model, data)
-    return bool(left < 1e3 * closed)
+    return bool(left < 1e3 * tolerance)
 
 
 def close_along_motion(
@@ -222,7 +222,7 @@ def close_along_motion(
         _close_from_home(machine, model, data, {}, linkage)
         return np.tile(data.qpos, (0 if joints else 1, 1))
     places = [model.joint(n).qposadr[0] for n in joints]
-    shaping = np.isin(list(joints), loop_shaping_joints(machine))
+    shaping = np.isin(list(joints), independent_loop_joints(machine))
     poses = np.empty((len(values), model.nq))
     for row, target in enumerate(values):
         moved = np.abs(target - values[row - 1])[shaping]
@@ -234,7 +234,7 @@ def close_along_motion(
                 _close_from_home(machine, model, data, asked, linkage)
             except InputError as error:
                 raise InputError(f"{error.where}, row {row}", error.message) from None
-        lock_drives(machine, model, data)
+        set_drives_to_load_positions(machine, model, data)
         poses[row] = data.qpos
     return poses
 
@@ -247,7 +247,7 @@ def _aim_cylinders(machine, model, data) -> None:
                 continue
             mujoco.mj_kinematics(model, data)
             tube = model.body(f"{name}_tube").id
-            rod_pin = model.site(pin_site(f"{name}_pin", "b")).id
+            rod_pin = model.site(pin_site_name(f"{name}_pin", "b")).id
             way = data.site_xpos[rod_pin] - data.xpos[tube]
             parent = data.xmat[model.body_parentid[tube]].reshape(3, 3)
             hinge = model.joint(f"{name}_tube")

@@ -16,7 +16,9 @@ from hydrotele.multibody.inverse_dynamics import project_on_drives
 _ERROR_LOCATION = "open loop"
 
 
-def set_state(model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray) -> None:
+def set_state_from_chain(
+    model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray
+) -> None:
     """Set the joint positions and velocities of a MuJoCo model from those of its chain.
 
     Args:
@@ -45,10 +47,10 @@ def set_state(model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position
             at, dof = at + 3, dof + 3
         turns = [where[f"{name}_r{letter}"] for letter in "xyz"]
         mujoco.mju_euler2Quat(data.qpos[at : at + 4], position[turns], "xyz")
-        data.qvel[dof : dof + 3] = _angular_velocity_matrix(position[turns]) @ rate[turns]
+        data.qvel[dof : dof + 3] = _cardan_rate_matrix(position[turns]) @ rate[turns]
 
 
-def _angular_velocity_matrix(angles: np.ndarray) -> np.ndarray:
+def _cardan_rate_matrix(angles: np.ndarray) -> np.ndarray:
     """Return the (3, 3) matrix from rates of x-y-z Cardan angles to the body's angular velocity."""
     _, b, c = angles
     sb, cb, sc, cc = np.sin(b), np.cos(b), np.sin(c), np.cos(c)
@@ -95,7 +97,7 @@ def open_loop_errors(
     model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     try:
         for first in firsts:
-            set_state(model, data, chain, found.position[first], found.rate[first])
+            set_state_from_chain(model, data, chain, found.position[first], found.rate[first])
             at = times[first] + (np.arange(steps) + 0.5) * model.opt.timestep
             driving = np.column_stack([np.interp(at, times, column) for column in force.T])
             for row in driving:

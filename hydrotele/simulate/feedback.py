@@ -19,15 +19,15 @@ from hydrotele.machine.machine import (
     Sensor,
     SensorError,
     SensorSet,
-    channel_converter,
-    channel_sensor,
+    find_channel_sensor,
+    make_channel_converter,
 )
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels
 from hydrotele.simulate.stepping import Stepper, apply_sensor_delays, true_sensor_values
 
 
-def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
+def sample_sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
     """Sample the random errors of a sensor channel for a whole run, reproducibly from the seed.
 
     Args:
@@ -97,14 +97,14 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray], time:
     """
     errors = machine.sensor_errors
     return {
-        c: errors[c].scale * _apply_coupling_errors(errors[c], v) + errors[c].offset_at(time)
+        c: errors[c].scale * _apply_shaft_coupling_errors(errors[c], v) + errors[c].offset_at(time)
         if c in errors
         else v
         for c, v in truth.items()
     }  # fmt: skip
 
 
-def _apply_coupling_errors(error: SensorError, values: np.ndarray) -> np.ndarray:
+def _apply_shaft_coupling_errors(error: SensorError, values: np.ndarray) -> np.ndarray:
     """Return the angles (n,) [rad] that a sensor measures behind a shaft coupling with tilt and backlash.
 
     The backlash is initially centred.
@@ -141,7 +141,7 @@ def simulate_readings(
     Returns:
         Channel -> (n,) readings.
 
-    Source: nominal model, "Sensors": noise first, then the converter; the machine's `sensor_errors`
+    Source: nominal model, "Sensors": noise first, then the converter; the machine's `sample_sensor_errors`
         act before both, also on ideal sensors.
     """
     readings = {}
@@ -150,12 +150,12 @@ def simulate_readings(
         if sensors and sensors.jitter and period:
             rows = np.arange(len(values))
             values = np.interp(rows + _sampling_jitter(sensors, seed, len(values)) / period, rows, values)
-        sensor = channel_sensor(machine, sensors, channel)
+        sensor = find_channel_sensor(machine, sensors, channel)
         if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
             if error is None:
-                error = sensor_errors(sensor, seed, channel, len(values))
-            values = _quantise_readings(values + error, *channel_converter(sensor, channel))
+                error = sample_sensor_errors(sensor, seed, channel, len(values))
+            values = _quantise_readings(values + error, *make_channel_converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
 
@@ -203,7 +203,7 @@ class Readings(NamedTuple):
 
 
 @compiled
-def read_sensors(sensors, values, errors):
+def convert_to_readings(sensors, values, errors):
     """Convert true values into readings, in place: scale, offset, random error, converter.
 
     Args:
@@ -222,13 +222,13 @@ def read_sensors(sensors, values, errors):
 
 
 @compiled
-def store_readings(values, hydraulic, sample_time, readings):
+def store_readings(values, hydraulic_count, sample_time, readings):
     """Store a new sample of all sensors and compute the joint rates by finite differences.
 
     Args:
         values: (c,) new readings: k joint positions, head and rod pressure of every hydraulic axis,
             supply pressure [rad] or [m], [Pa].
-        hydraulic: number of hydraulic axes, scalar.
+        hydraulic_count: number of hydraulic axes, scalar.
         sample_time: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
         readings: Readings, written except for the supply pressure.
 
@@ -239,9 +239,9 @@ def store_readings(values, hydraulic, sample_time, readings):
     for i in range(k):
         readings.rate[i] = (values[i] - readings.joint[i]) / sample_time if sample_time > 0.0 else 0.0
         readings.joint[i] = values[i]
-    for i in range(hydraulic):
+    for i in range(hydraulic_count):
         readings.head[i], readings.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
-    return values[k + 2 * hydraulic] if hydraulic > 0 else 0.0
+    return values[k + 2 * hydraulic_count] if hydraulic_count > 0 else 0.0
 
 
 class FeedbackTable(NamedTuple):
@@ -263,7 +263,7 @@ class FeedbackTable(NamedTuple):
 
 
 @compiled
-def sample_sensors(table, sim, tick, steps):
+def sample_sensors_if_due(table, sim, tick, steps):
     """Take a new sample if one is due at this control tick; otherwise hold the last one.
 
     Args:
@@ -282,7 +282,7 @@ def sample_sensors(table, sim, tick, steps):
     values = np.empty(len(sim.sensor_history.before))
     true_sensor_values(sim, values)
     apply_sensor_delays(sim.sensor_history, tick * steps, values)
-    read_sensors(table.sensors, values, table.errors[tick // table.ticks_per_sample])
+    convert_to_readings(table.sensors, values, table.errors[tick // table.ticks_per_sample])
     span = table.period if tick > 0 else 0.0
     table.readings.supply[0] = store_readings(values, sim.hydraulic, span, table.readings)
 
@@ -319,7 +319,7 @@ class Feedback:
             tick: the control tick, equal to that of the stepper.
             stepper: the stepper of the plant.
         """
-        sample_sensors(self.table, stepper.sim, tick, stepper.steps)
+        sample_sensors_if_due(self.table, stepper.sim, tick, stepper.steps)
 
 
 def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: int, control_rate: float) -> Feedback:
@@ -341,9 +341,9 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
     """
     every, k = periods_per_sample(control_rate, sensors), len(plant.axes)
     names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (1 if plant.hydraulic else 0)]
-    kinds = {name: channel_sensor(plant.machine, sensors, name) for name in names}
+    kinds = {name: find_channel_sensor(plant.machine, sensors, name) for name in names}
     count = ticks // every + 1  # including the unused sample after the last tick
-    errors = {name: sensor_errors(kinds[name], seed, name, count) for name in names}
+    errors = {name: sample_sensor_errors(kinds[name], seed, name, count) for name in names}
     defects = [plant.machine.sensor_errors.get(name, SensorError()) for name in names]
     time = every / control_rate * np.arange(count)
     changes = [d.offset_at(time) - d.offset for d in defects]
@@ -352,7 +352,7 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
         every / control_rate,
         SensorParameters(
             np.array([d.scale for d in defects]), np.array([d.offset for d in defects]),
-            *np.array([channel_converter(kinds[name], name) for name in names]).T.copy(),
+            *np.array([make_channel_converter(kinds[name], name) for name in names]).T.copy(),
         ),
         np.column_stack(list(errors.values())) + np.column_stack(changes),
         Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(1)),

@@ -78,7 +78,7 @@ class SimulationBatch:
         size = self._library.mjb_nstate(handle)
         self.state = self._native.view_memory(self._library.mjb_state(handle), (count, size))
 
-    def expand_field(self, name: str) -> np.ndarray:
+    def expand_field_per_simulation(self, name: str) -> np.ndarray:
         """Let the values of a float field of the model differ between the simulations.
 
         Args:
@@ -119,11 +119,11 @@ class SimulationBatch:
             words = self._library.mjb_error(native.handle, first).decode()
             raise RuntimeError(f"simulation {first}: {words}")
 
-    def get_model(self, number: int, model: mujoco.MjModel) -> None:
+    def copy_model_into(self, number: int, model: mujoco.MjModel) -> None:
         """Copy the model of simulation `number` into `model`, which must have the same sizes."""
         self._library.mjb_getModel(self._require_native().handle, number, model._address)
 
-    def get_data(self, number: int, data: mujoco.MjData) -> None:
+    def copy_data_into(self, number: int, data: mujoco.MjData) -> None:
         """Copy the state of simulation `number` into `data`, which must have the same sizes."""
         self._library.mjb_getData(self._require_native().handle, number, data._address)
 

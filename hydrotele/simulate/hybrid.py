@@ -21,9 +21,9 @@ from hydrotele.kinematics.hybrid import (
     UnreachableError,
     euler_to_rotation,
     forward_kinematics,
+    frames_at_zero_joints,
     home_pose,
     leg_readings,
-    zero_frames,
 )
 from hydrotele.kinematics.wires import WireGeometry, pose_covariance, wire_lengths
 
@@ -187,7 +187,7 @@ def build_hybrid_mechanism(robot: HybridRobot) -> mujoco.MjSpec:
     base = spec.worldbody.add_body(name="frame0", pos=[0, 0, 0.3], quat=_world_quaternion())
     _add_rails(base, robot)
     parent, links = base, []
-    frames, last = zero_frames(robot)
+    frames, last = frames_at_zero_joints(robot)
     for i, (name, kind) in enumerate(zip(robot.joints, robot.kinds, strict=True)):
         body = parent.add_body(name=name)
         turning = kind == REVOLUTE

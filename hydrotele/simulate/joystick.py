@@ -23,8 +23,8 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, matrix_view
 from hydrotele.core.mjcf import load_spec, read_mjcf
-from hydrotele.machine.joystick import Joystick, principal_values
-from hydrotele.simulate.layout import call_step, function_address
+from hydrotele.machine.joystick import Joystick, find_principal_values
+from hydrotele.simulate.layout import call_mj_step, function_address
 
 GRAVITY = -9.81
 _COOLED_HEAT = 0.9  # relative heat below which the largest current is allowed again after overheating
@@ -55,7 +55,7 @@ class SimulatedFlotor:
         hand: whether the operator holds the handle.
         heat: (6,) relative heat of the coils, see `heat_step`.
         record: (1,) the simulation as a record for compiled code, see `flotor_step`.
-        has_edge_loss: whether coils lose force towards the end of their gap; `weaken_coils` must then be
+        has_edge_loss: whether coils lose force towards the end of their gap; `update_coil_force_constants` must then be
             called before every period.
     """
 
@@ -148,38 +148,38 @@ class SimulatedFlotor:
         """
         return float(self.record["allowed"][0])
 
-    def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
+    def step(self, currents: np.ndarray, operator_wrench: np.ndarray) -> None:
         """Simulate one control period with constant coil currents and a constant force of the operator.
 
         Args:
             currents: (6,) coil currents [A].
-            muscles: (6,) force of the operator on the handle along the stator's axes [N] and torque
+            operator_wrench: (6,) force of the operator on the handle along the stator's axes [N] and torque
                 about them [N m].
         """
         if self.has_edge_loss:
-            self.weaken_coils()
-        _step_record(self.record, np.asarray(currents, float), np.asarray(muscles, float))
+            self.update_coil_force_constants()
+        _step_flotor_record(self.record, np.asarray(currents, float), np.asarray(operator_wrench, float))
 
     def step_in_cab(
-        self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
+        self, currents: np.ndarray, operator_wrench: np.ndarray, mount: np.ndarray, spin: float,
         spin_rate: float,
     ) -> None:  # fmt: skip
         """Simulate one control period like `step`, but in a cab that rotates about a vertical axis.
 
         Args:
             currents: (6,) coil currents [A].
-            muscles: (6,) force and torque of the operator on the handle [N], [N m].
+            operator_wrench: (6,) force and torque of the operator on the handle [N], [N m].
             mount: (3,) position of the joystick relative to the cab's axis [m].
             spin: angular velocity of the cab [rad/s].
             spin_rate: its angular acceleration [rad/s^2].
         """
         if self.has_edge_loss:
-            self.weaken_coils()
+            self.update_coil_force_constants()
         self._arrays["mount"][:] = mount
-        currents, muscles = np.asarray(currents, float), np.asarray(muscles, float)
-        _step_record_in_cab(self.record, currents, muscles, float(spin), float(spin_rate))
+        currents, operator_wrench = np.asarray(currents, float), np.asarray(operator_wrench, float)
+        _step_record_in_cab(self.record, currents, operator_wrench, float(spin), float(spin_rate))
 
-    def weaken_coils(self) -> None:
+    def update_coil_force_constants(self) -> None:
         """Set the force per ampere of each coil according to the flotor's pose.
 
         It decreases with the distance of a coil from its nominal position, where the field is weaker.
@@ -213,13 +213,13 @@ def _damping_matrix(model: mujoco.MjModel) -> np.ndarray:
 
 
 @compiled
-def flotor_step(r, currents, muscles):
+def flotor_step(r, currents, operator_wrench):
     """Advance the flotor by one control period with constant currents.
 
     Args:
         r: `SimulatedFlotor.record[0]`; the heat and the MuJoCo state it points to are written.
         currents: (6,) coil currents [A].
-        muscles: (6,) force and torque of the operator on the handle [N], [N m].
+        operator_wrench: (6,) force and torque of the operator on the handle [N], [N m].
 
     Returns:
         Nothing.
@@ -228,18 +228,18 @@ def flotor_step(r, currents, muscles):
     """
     applied = float64_view(r.applied, 6)
     for i in range(6):
-        applied[i] = muscles[i]
+        applied[i] = operator_wrench[i]
     _simulate_period(r, currents)
 
 
 @compiled
-def flotor_step_in_cab(r, currents, muscles, spin, spin_rate):
+def flotor_step_in_cab(r, currents, operator_wrench, spin, spin_rate):
     """Advance the flotor by one control period in a cab that rotates about a vertical axis.
 
     Args:
         r: `SimulatedFlotor.record[0]`; the heat and the MuJoCo state it points to are written.
         currents: (6,) coil currents [A].
-        muscles: (6,) force and torque of the operator on the handle [N], [N m].
+        operator_wrench: (6,) force and torque of the operator on the handle [N], [N m].
         spin: angular velocity of the cab, scalar [rad/s].
         spin_rate: its angular acceleration, scalar [rad/s^2].
 
@@ -248,9 +248,9 @@ def flotor_step_in_cab(r, currents, muscles, spin, spin_rate):
 
     Source: inertial forces in a rotating frame.
     """
-    _cab_forces(
+    _compute_cab_inertial_forces(
         r.mass, float64_view(r.com, 3), matrix_view(r.inertia, 3, 3), float64_view(r.mount, 3), spin, spin_rate,
-        muscles, float64_view(r.gravity, 3), float64_view(r.applied, 6),
+        operator_wrench, float64_view(r.gravity, 3), float64_view(r.applied, 6),
     )  # fmt: skip
     _simulate_period(r, currents)
 
@@ -272,7 +272,7 @@ def _simulate_period(r, currents):
         r.allowed = r.max_current
     if not r.leaps:
         for _ in range(r.steps):
-            call_step(r.mj_step, r.model, r.data)
+            call_mj_step(r.mj_step, r.model, r.data)
         return
     inputs = ctrl, float64_view(r.applied, 6), float64_view(r.gravity, 3)
     before, speed = matrix_view(r.before, 2, _INPUT_COUNT), float64_view(r.speed, 6)
@@ -283,13 +283,13 @@ def _simulate_period(r, currents):
         for i in range(_INPUT_COUNT):
             before[0, i] = before[1, i]
         _set_step_inputs(inputs, before, damping, speed, 0.0)
-        call_step(r.mj_forward, r.model, r.data)
+        call_mj_step(r.mj_forward, r.model, r.data)
         acceleration = float64_view(r.acceleration, 6)
         for i in range(6):
             speed[i] -= 0.5 * r.timestep * acceleration[i]
     for k in range(r.steps):
         _set_step_inputs(inputs, before, damping, speed, 0.0 if k else 0.5)
-        call_step(r.mj_step, r.model, r.data)
+        call_mj_step(r.mj_step, r.model, r.data)
 
 
 @compiled
@@ -325,13 +325,13 @@ def _set_step_inputs(inputs, before, half_damping, speed, previous_weight):
 
 
 @compiled
-def _step_record(record, currents, muscles):
-    flotor_step(record[0], currents, muscles)
+def _step_flotor_record(record, currents, operator_wrench):
+    flotor_step(record[0], currents, operator_wrench)
 
 
 @compiled
-def _step_record_in_cab(record, currents, muscles, spin, spin_rate):
-    flotor_step_in_cab(record[0], currents, muscles, spin, spin_rate)
+def _step_record_in_cab(record, currents, operator_wrench, spin, spin_rate):
+    flotor_step_in_cab(record[0], currents, operator_wrench, spin, spin_rate)
 
 
 @compiled
@@ -387,7 +387,7 @@ def coil_force_factors(
 
 
 @compiled
-def _cab_forces(mass, com, inertia, mount, w, a, muscles, gravity, out):
+def _compute_cab_inertial_forces(mass, com, inertia, mount, w, a, operator_wrench, gravity, out):
     """Compute apparent gravity and inertial forces of a flotor in a frame that rotates about the vertical.
 
     Args:
@@ -397,19 +397,19 @@ def _cab_forces(mass, com, inertia, mount, w, a, muscles, gravity, out):
         mount: (3,) position of the joystick relative to the axis of rotation [m].
         w: angular velocity of the frame, scalar [rad/s].
         a: its angular acceleration, scalar [rad/s^2].
-        muscles: (6,) force and torque of the operator [N], [N m].
+        operator_wrench: (6,) force and torque of the operator [N], [N m].
         gravity: (3,) written: gravity minus the acceleration of the mount [m/s^2].
         out: (6,) written: operator's force and torque plus the inertial ones [N], [N m].
     """
     gravity[0] = w * w * mount[0] + a * mount[1]
     gravity[1] = w * w * mount[1] - a * mount[0]
     gravity[2] = GRAVITY
-    out[0] = muscles[0] + mass * (a * com[1] + w * w * com[0])
-    out[1] = muscles[1] + mass * (-a * com[0] + w * w * com[1])
-    out[2] = muscles[2]
-    out[3] = muscles[3] - inertia[0, 2] * a + w * w * inertia[1, 2]
-    out[4] = muscles[4] - inertia[1, 2] * a - w * w * inertia[0, 2]
-    out[5] = muscles[5] - inertia[2, 2] * a
+    out[0] = operator_wrench[0] + mass * (a * com[1] + w * w * com[0])
+    out[1] = operator_wrench[1] + mass * (-a * com[0] + w * w * com[1])
+    out[2] = operator_wrench[2]
+    out[3] = operator_wrench[3] - inertia[0, 2] * a + w * w * inertia[1, 2]
+    out[4] = operator_wrench[4] - inertia[1, 2] * a - w * w * inertia[0, 2]
+    out[5] = operator_wrench[5] - inertia[2, 2] * a
 
 
 def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
@@ -437,7 +437,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
     coils.pos = np.negative(facts_flotor.handle)
     degrees = 180.0 / math.pi if spec.compiler.degree else 1.0
-    _place_stops(spec, facts, path)
+    _place_end_stop_walls(spec, facts, path)
     joints["turn"].range = (0.0, degrees * facts.workspace.rotation)
     for actuator in spec.actuators:
         actuator.ctrlrange = (-facts.coils.max_current, facts.coils.max_current)
@@ -463,7 +463,7 @@ def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
     return read_mjcf(Path(facts.folder, facts.mjcf)).compile(spec)
 
 
-def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
+def _place_end_stop_walls(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
     """Place the six end-stop walls so that the ball at the coils' centre touches them at the end of its travel."""
     ball, far = spec.geom("gap"), facts.workspace.translation
     walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
@@ -488,7 +488,7 @@ def _add_arm_impedance(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
         turns = name == "turn"
         joints[name].stiffness[0] = hand.rotation_stiffness if turns else hand.stiffness
         joints[name].damping[0] = hand.rotation_damping if turns else hand.damping
-    firm, heavy = principal_values(hand.stiffness_shape), principal_values(hand.mass_shape)
+    firm, heavy = find_principal_values(hand.stiffness_shape), find_principal_values(hand.mass_shape)
     joints["z"].armature = hand.mass - hand.carried_mass
     for name in ("x", "y"):
         joints[name].stiffness[0] *= firm.min_value

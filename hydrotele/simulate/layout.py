@@ -125,7 +125,7 @@ _PROBE_MODEL = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" d
 
 
 @functools.cache
-def verify_layout() -> None:
+def verify_struct_offsets() -> None:
     """Check the computed offsets of MuJoCo's structs against the Python bindings on a small model.
 
     Raises:
@@ -181,7 +181,7 @@ def verify_layout() -> None:
 
 
 @intrinsic
-def call_step(typingctx, function, model, data):
+def call_mj_step(typingctx, function, model, data):
     """Call `mj_step(model, data)` from compiled code, or another C function of these arguments.
 
     All arguments are addresses, given as integers.
@@ -198,7 +198,7 @@ def call_step(typingctx, function, model, data):
 
 
 @intrinsic
-def call_contact_force(typingctx, function, model, data, contact, wrench):
+def call_mj_contact_force(typingctx, function, model, data, contact, wrench):
     """Call `mj_contactForce(model, data, contact, wrench)` from compiled code to get a contact wrench.
 
     `contact` is the index of the contact; all other arguments are addresses, given as integers.
@@ -218,7 +218,7 @@ def call_contact_force(typingctx, function, model, data, contact, wrench):
 
 
 @intrinsic
-def call_set_state(typingctx, function, model, data, state, spec):
+def call_mj_set_state(typingctx, function, model, data, state, spec):
     """Call `mj_setState(model, data, state, spec)` from compiled code to set the simulation state.
 
     `spec` selects the parts of the state; all other arguments are addresses, given as integers.

@@ -35,8 +35,8 @@ from hydrotele.hydraulics.parameters import (
 from hydrotele.kinematics.from_machine import (
     drive_travel,
     has_ball_ends,
+    joint_range_at_drive,
     pin_axis,
-    range_at_drive,
 )
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
@@ -53,7 +53,7 @@ TIP_SITE = f"{NAME_PREFIX}tip"
 """Name of the site at the arm's tip."""
 
 
-def pin_site(closure: str, end: str) -> str:
+def pin_site_name(closure: str, end: str) -> str:
     """Return the name of the MuJoCo site at one end (`a` or `b`) of a pin joint that closes a loop.
 
     The rod pin of a cylinder has the closure name `<axis>_pin`.
@@ -142,17 +142,17 @@ def _contacts_by_class(root: Element) -> dict[str, bool]:
     """Return for each default class of an MJCF whether its geoms can have contacts by default."""
     table: dict[str, bool] = {}
 
-    def walk(element: Element, name: str, contype: int, conaffinity: int) -> None:
+    def visit_default_class(element: Element, name: str, contype: int, conaffinity: int) -> None:
         geom = element.find("geom")
         if geom is not None:
             contype = int(geom.get("contype", contype))
             conaffinity = int(geom.get("conaffinity", conaffinity))
         table[name] = bool(contype or conaffinity)
         for child in element.findall("default"):
-            walk(child, child.get("class", "main"), contype, conaffinity)
+            visit_default_class(child, child.get("class", "main"), contype, conaffinity)
 
     for top in root.findall("default"):
-        walk(top, top.get("class", "main"), 1, 1)
+        visit_default_class(top, top.get("class", "main"), 1, 1)
     table.setdefault("main", True)
     return table
 
@@ -233,10 +233,10 @@ def _add_machine_elements(
         if axis.cylinder:
             _write_cylinder(root, name, axis.cylinder, pin_axis(machine, name), timestep)
             if has_ball_ends(machine, name):
-                _write_ball_end(root, name)
+                _add_tube_tilt_hinge(root, name)
             _write_travel(root, machine, name)
-    for name in flexible_axes(machine):
-        write_drive_side(root, machine, name)
+    for name in axes_with_transmission(machine):
+        add_transmission_drive_side(root, machine, name)
     for name, closure in machine.closures.items():
         _add_pin(root, name, closure.a, closure.b, timestep)
     if machine.arm:
@@ -314,7 +314,7 @@ def _reject_foreign_elements(root, machine: Machine) -> None:
     """
     known = set(machine.joints)
     for name, axis in machine.axes.items():
-        known |= {f"{name}_tube", f"{name}_rod", tilt_joint(name)} if axis.cylinder else set()
+        known |= {f"{name}_tube", f"{name}_rod", tilt_joint_name(name)} if axis.cylinder else set()
     for name, link in machine.links.items():
         body = root.find("body", name)
         if body is not None and link.joint is None:
@@ -421,20 +421,20 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
     _add_pin(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
 
 
-def _write_ball_end(root, name: str) -> None:
+def _add_tube_tilt_hinge(root, name: str) -> None:
     """Add a second hinge at the base of a tube with ball ends, so that it can also tilt sideways.
 
     Its axis is perpendicular to the first hinge and to the tube.
     """
-    if root.find("joint", tilt_joint(name)) is None:
+    if root.find("joint", tilt_joint_name(name)) is None:
         first = root.find("joint", f"{name}_tube")
         across = np.cross((1.0, 0.0, 0.0), first.axis)
         root.find("body", f"{name}_tube").add(
-            "joint", name=tilt_joint(name), type="hinge", axis=across / np.linalg.norm(across)
+            "joint", name=tilt_joint_name(name), type="hinge", axis=across / np.linalg.norm(across)
         )
 
 
-def tilt_joint(axis: str) -> str:
+def tilt_joint_name(axis: str) -> str:
     """Return the name of the joint that tilts a tube with ball ends out of its plane of motion."""
     return f"{axis}_tube_tilt"
 
@@ -446,16 +446,16 @@ def _write_travel(root, machine: Machine, name: str) -> None:
     would share the load.
     """
     root.find("joint", f"{name}_rod").range = drive_travel(machine, name)
-    if range_at_drive(machine, name):
+    if joint_range_at_drive(machine, name):
         root.find("joint", machine.axes[name].joint).limited = "false"
 
 
 def _add_pin(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
     """Add the two sites and the `connect` constraint of a pin."""
     for end, pin in (("a", a), ("b", b)):
-        _find_body(root, pin.link).add("site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4)
+        _find_body(root, pin.link).add("site", name=pin_site_name(name, end), pos=pin.position, size=(0.03,), group=4)
     root.equality.add(
-        "connect", name=name, site1=pin_site(name, "a"), site2=pin_site(name, "b"),
+        "connect", name=name, site1=pin_site_name(name, "a"), site2=pin_site_name(name, "b"),
         solref=(2.0 * timestep, 1.0), solimp=_IMPEDANCE,
     )  # fmt: skip
 
@@ -466,7 +466,7 @@ def _write_actuators(root, machine: Machine) -> None:
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
             "general", name=name, user=numbers, biastype="user",
-            joint=drive_joint(machine, name),
+            joint=drive_joint_name(machine, name),
         )  # fmt: skip
         if axis.is_hydraulic:
             last = name == list(machine.hydraulic_axes)[-1]  # owns the additional states
@@ -518,23 +518,23 @@ _MIN_INERTIAL = (
 _MIN_DEFLECTION = 1.0e-9  # m or rad: smaller static deflections count as no load inside the backlash
 
 
-def drive_joint(machine: Machine, axis: str) -> str:
+def drive_joint_name(machine: Machine, axis: str) -> str:
     """Return the name of the joint that the actuator of an axis acts on: the drive side of a transmission."""
-    return f"{axis}_drive" if machine.axes[axis].transmission else load_joint(machine, axis)
+    return f"{axis}_drive" if machine.axes[axis].transmission else load_joint_name(machine, axis)
 
 
-def load_joint(machine: Machine, axis: str) -> str:
+def load_joint_name(machine: Machine, axis: str) -> str:
     """Return the name of the load-side joint: a cylinder's rod slide, else the axis' joint."""
     facts = machine.axes[axis]
     return f"{axis}_rod" if facts.cylinder else facts.joint
 
 
-def flexible_axes(machine: Machine) -> list[str]:
+def axes_with_transmission(machine: Machine) -> list[str]:
     """Return the names of the axes with a transmission, which is a spring and damper between drive and load."""
     return [name for name, axis in machine.axes.items() if axis.transmission]
 
 
-def write_drive_side(root, machine: Machine, axis: str) -> None:
+def add_transmission_drive_side(root, machine: Machine, axis: str) -> None:
     """Add the drive side of an axis with a transmission to an MJCF that contains the load side.
 
     Args:
@@ -547,7 +547,7 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
     """
     facts = machine.axes[axis].transmission
     assert facts
-    name, load = drive_joint(machine, axis), root.find("joint", load_joint(machine, axis))
+    name, load = drive_joint_name(machine, axis), root.find("joint", load_joint_name(machine, axis))
     if root.find("body", name) is not None or root.find("joint", name) is not None:
         message = f"is the name of the drive side of axis {axis}; rename the link"
         raise InputError(f"links.{name}", message)
@@ -570,18 +570,18 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
     tendon.add("joint", joint=load.name, coef=-1.0)
 
 
-def lock_drives(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def set_drives_to_load_positions(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Set the position of every drive side in `qpos` to that of its load, so that no transmission is deflected."""
-    for axis in flexible_axes(machine):
-        drive, load = drive_joint(machine, axis), load_joint(machine, axis)
+    for axis in axes_with_transmission(machine):
+        drive, load = drive_joint_name(machine, axis), load_joint_name(machine, axis)
         data.qpos[model.joint(drive).qposadr[0]] = data.qpos[model.joint(load).qposadr[0]]
 
 
 def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[int], list[int]]:
     """Return the indices in `qvel` of the drive sides of all transmissions, and of their load sides."""
-    axes = flexible_axes(machine)
-    drives = [int(model.joint(drive_joint(machine, a)).dofadr[0]) for a in axes]
-    loads = [int(model.joint(load_joint(machine, a)).dofadr[0]) for a in axes]
+    axes = axes_with_transmission(machine)
+    drives = [int(model.joint(drive_joint_name(machine, a)).dofadr[0]) for a in axes]
+    loads = [int(model.joint(load_joint_name(machine, a)).dofadr[0]) for a in axes]
     return drives, loads
 
 
@@ -597,12 +597,12 @@ def preload_transmissions(
         force: axis -> force of its drive [N] or [N m]; with zero force the drive stays in the
             middle of the backlash.
     """
-    for axis in flexible_axes(machine):
+    for axis in axes_with_transmission(machine):
         facts = machine.axes[axis].transmission
         assert facts
         deflection = force[axis] / facts.stiffness
         if abs(deflection) > _MIN_DEFLECTION:
             deflection += np.sign(deflection) * facts.backlash / 2.0
-        drive = model.joint(drive_joint(machine, axis)).qposadr[0]
-        load = model.joint(load_joint(machine, axis)).qposadr[0]
+        drive = model.joint(drive_joint_name(machine, axis)).qposadr[0]
+        load = model.joint(load_joint_name(machine, axis)).qposadr[0]
         data.qpos[drive] = data.qpos[load] + deflection

@@ -26,7 +26,7 @@ from numba import carray, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.core.compiled import allocation_free, callback, compiled
+from hydrotele.core.compiled import callback, compile_without_allocation, compiled
 from hydrotele.core.memory import address_to_pointer, float64_view
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, implicit_bristle_friction
 from hydrotele.hydraulics.circuit import (
@@ -38,17 +38,17 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     add_command_terms,
-    advance_term_states,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     delivered_flow_fraction,
-    drive_state,
     implicit_friction,
+    make_drive_state,
     pump_drive_force,
     step_circuit,
+    write_term_state_rates,
 )
 from hydrotele.hydraulics.parameters import ACTUATOR_MARKER, CURVE_KNOTS, CURVE_SIZE
-from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
+from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_struct_offsets
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND, COUNT_INDEX, FORCE, has_term, sum_terms_with_slope
 from hydrotele.terms.table import TERMS_MARKER as TERMS
@@ -90,7 +90,7 @@ def _stack_space(typingctx, size):
 
 
 @compiled
-def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
+def _read_passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
     """Read MuJoCo's passive (spring and damper) force on the joint of actuator i [N] or [N m].
 
     `m` and `d` are the addresses of mjModel and mjData; all further arguments are field offsets.
@@ -169,14 +169,14 @@ def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
         act = scratch[SCRATCH_SIZE:]
         for k in range(size):
             act[k] = start[k] + dt * rate[k]
-        compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+        compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
         supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
-    s = drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
+    s = make_drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
     return s, Drives(count, act, lengths, velocities, commands)
 
 
-@allocation_free
-def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
+@compile_without_allocation
+def _write_force_drive_rates(user, u, act, rate, velocity, command, low, high, dt):
     """Write the rates (2,) of the activations of a force drive with presliding friction.
 
     The first is the bristle state, and the second the command, limited to `low` .. `high`. It reaches
@@ -186,8 +186,8 @@ def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
 
 
-@allocation_free
-def _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
+@compile_without_allocation
+def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
     """Step the hydraulic circuit, and write the rates of bristles and of terms with an internal state.
 
     The arguments are those of `step_circuit`. `arrived` (nu,) are the commands before command terms.
@@ -202,10 +202,10 @@ def _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _BRISTLE_INERTIA], dt)
     if len(terms) > 0 and first == 0:
         begun = Drives(count, act, length, velocity, arrived)
-        advance_term_states(user, terms, begun, act_dot, dt, time, supply)
+        write_term_state_rates(user, terms, begun, act_dot, dt, time, supply)
 
 
-@allocation_free
+@compile_without_allocation
 def _has_valid_indices(user, first, count, nu, free):
     """Return whether all indices among the parameters of the hydraulic axes are within bounds.
 
@@ -232,7 +232,7 @@ def _has_valid_indices(user, first, count, nu, free):
     return True
 
 
-@allocation_free
+@compile_without_allocation
 def _command_or_zero(command, k):
     """Return the command of actuator k, or 0 if any command (nu,) is NaN, as MuJoCo does."""
     for value in command:
@@ -248,7 +248,7 @@ def _compile_callbacks():
     Returns:
         (callback for `mjcb_act_dyn`, callback for `mjcb_act_bias`).
     """
-    verify_layout()
+    verify_struct_offsets()
     remembering = _make_callbacks(True)
     for symbol, function in zip((_ADVANCE_EXTENDED.symbol, _FORCE_EXTENDED.symbol), remembering, strict=True):
         binding.add_symbol(symbol, function.address)
@@ -280,7 +280,7 @@ def _make_callbacks(has_extra_states):
     d_length, d_velocity = data_at["actuator_length"], data_at["actuator_velocity"]
 
     @callback(_SIGNATURE)
-    def advance(m, d, i):
+    def write_activation_rates(m, d, i):
         """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`).
 
         `m` and `d` are the addresses of mjModel and mjData. The last hydraulic actuator i does the work.
@@ -306,7 +306,7 @@ def _make_callbacks(has_extra_states):
                     return 0.0
                 at_range = carray(address_to_pointer(m + m_range), (1,), np.int64)[0]
                 ends = float64_view(at_range + 16 * i, 2)
-                _advance_force_drive(
+                _write_force_drive_rates(
                     user, i * SLOT_COUNT,
                     float64_view(carray(address_to_pointer(d + d_act), (1,), np.int64)[0] + start, 2),
                     float64_view(carray(address_to_pointer(d + d_act_dot), (1,), np.int64)[0] + start, 2),
@@ -361,7 +361,7 @@ def _make_callbacks(has_extra_states):
                 np.int64(NO_EXTRA_STATES),  # numba would compile again for a literal
             )  # fmt: skip
         else:
-            _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
+            _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
         return 0.0
 
     @callback(_SIGNATURE)
@@ -437,7 +437,7 @@ def _make_callbacks(has_extra_states):
             share += dt * rising
             if user[u + _INERTIA] == 0.0:
                 return drive - bristle_friction(user, u, share, velocity, user[u + _BRISTLE_INERTIA], dt)[0]
-        push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
+        push = drive + _read_passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
         if gain != 0.0:
             at_ctrl = carray(address_to_pointer(d + d_ctrl), (1,), np.int64)[0]
             push += gain * _command_or_zero(carray(address_to_pointer(at_ctrl), (nu,), np.float64), i)
@@ -449,7 +449,7 @@ def _make_callbacks(has_extra_states):
             rubbing = implicit_bristle_friction(user, u, share, velocity, push, inertia, dt)
         return drive - damping * (dt / inertia) * (push - rubbing) - rubbing
 
-    return advance, force
+    return write_activation_rates, force
 
 
 def stop_profiling_clock() -> None:

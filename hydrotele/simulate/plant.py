@@ -24,11 +24,11 @@ from hydrotele.hydraulics.circuit import (
     ACTIVATIONS_PER_AXIS,
     SCRATCH_SIZE,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     delivered_flow_fraction,
-    drive_state,
+    make_drive_state,
 )
-from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
+from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_released_air
 from hydrotele.hydraulics.parameters import (
     Slot,
     actuator_order,
@@ -44,9 +44,9 @@ from hydrotele.simulate.mechanism import (
     Mjcf,
     add_element,
     assemble_mjcf,
-    drive_joint,
-    flexible_axes,
-    load_joint,
+    axes_with_transmission,
+    drive_joint_name,
+    load_joint_name,
     mjcf_document,
     preload_transmissions,
 )
@@ -80,13 +80,13 @@ def set_bristle_inertias(machine: Machine, model: mujoco.MjModel) -> None:
     yielding = np.linalg.inv(basis.T @ mass @ basis)
     for i, (name, axis) in enumerate(zip(order, axes, strict=True)):
         if axis.drive.friction.has_presliding:
-            lever = basis[model.joint(drive_joint(machine, name)).dofadr[0]]
+            lever = basis[model.joint(drive_joint_name(machine, name)).dofadr[0]]
             moved = 1.0 / float(lever @ yielding @ lever)
             own = axis.transmission.inertia if axis.transmission else moved
             model.actuator_user[i, Slot.BRISTLE_INERTIA] = own
 
 
-def write_bristle_inertias(root, machine: Machine, model: mujoco.MjModel) -> None:
+def copy_bristle_inertias_to_mjcf(root, machine: Machine, model: mujoco.MjModel) -> None:
     """Copy the parameters written by `set_bristle_inertias` from a model to the machine's MJCF."""
     for i, name in enumerate(actuator_order(machine)):
         if machine.axes[name].drive.friction.has_presliding:
@@ -101,9 +101,9 @@ _IMPEDANCE_TRANSITION = (
 )  # width, midpoint, power of the impedance; unused: d is constant
 
 
-def stop_joints(machine: Machine) -> dict[str, str]:
+def end_stop_joints(machine: Machine) -> dict[str, str]:
     """Return for each axis with an end stop the name of the joint whose limits are this end stop."""
-    return {name: load_joint(machine, name) for name in machine.axes if machine.end_stop(name)}
+    return {name: load_joint_name(machine, name) for name in machine.axes if machine.end_stop(name)}
 
 
 def set_end_stops(machine: Machine, model: mujoco.MjModel) -> None:
@@ -120,7 +120,7 @@ def set_end_stops(machine: Machine, model: mujoco.MjModel) -> None:
     Source: MuJoCo documentation, "Computation", constraint model.
     """
     h = model.opt.timestep
-    for axis, name in stop_joints(machine).items():
+    for axis, name in end_stop_joints(machine).items():
         stop, joint = machine.end_stop(axis), model.joint(name).id
         assert stop
         both = stop.damping + h * stop.stiffness
@@ -130,9 +130,9 @@ def set_end_stops(machine: Machine, model: mujoco.MjModel) -> None:
         model.jnt_solimp[joint] = d, d, *_IMPEDANCE_TRANSITION
 
 
-def write_end_stops(root, machine: Machine, model: mujoco.MjModel) -> None:
+def copy_end_stops_to_mjcf(root, machine: Machine, model: mujoco.MjModel) -> None:
     """Copy the parameters written by `set_end_stops` from a model to the machine's MJCF."""
-    for name in stop_joints(machine).values():
+    for name in end_stop_joints(machine).values():
         joint, numbers = root.find("joint", name), model.joint(name).id
         joint.solreflimit = model.jnt_solref[numbers]
         joint.solimplimit = model.jnt_solimp[numbers]
@@ -223,8 +223,8 @@ class Plant:
     def document(self) -> Mjcf:
         """The complete MJCF with visual geometry and the `home` keyframe; built on first access."""
         root = assemble_mjcf(self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings)
-        write_end_stops(root, self.machine, self.model)
-        write_bristle_inertias(root, self.machine, self.model)
+        copy_end_stops_to_mjcf(root, self.machine, self.model)
+        copy_bristle_inertias_to_mjcf(root, self.machine, self.model)
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
@@ -262,11 +262,11 @@ def build_plant(
     model = mjcf_document(root).compile()
     set_end_stops(machine, model)
     set_bristle_inertias(machine, model)
-    if not _can_touch(model):  # saves the contact search, a tenth of a step
+    if not _can_have_contacts(model):  # saves the contact search, a tenth of a step
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     axes = tuple(actuator_order(machine))
     joints = [model.joint(machine.axes[name].joint) for name in axes]
-    drives = [model.joint(drive_joint(machine, name)) for name in axes]
+    drives = [model.joint(drive_joint_name(machine, name)) for name in axes]
     places = np.array([joint.qposadr[0] for joint in drives], dtype=int)
     piston = np.array([machine.axes[name].cylinder is not None for name in axes])
     return Plant(
@@ -299,7 +299,7 @@ def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, i
     return places
 
 
-def _can_touch(model: mujoco.MjModel) -> bool:
+def _can_have_contacts(model: mujoco.MjModel) -> bool:
     """Return whether any pair of geoms in the model can have a contact."""
     makes, takes = model.geom_contype, model.geom_conaffinity
     meet = (makes[:, None] & takes[None, :]) | (takes[:, None] & makes[None, :])
@@ -329,7 +329,7 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     forces = forces - term_forces_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         axis = plant.machine.axes[name]
-        head, rod = axis.hydraulic_drive.areas
+        head, rod = axis.hydraulic_drive.effective_areas
         rest = axis.pump.accumulator.pressure if axis.pump else REST_PRESSURE
         p_head, p_rod = (forces[i] + rod * rest) / head, rest
         if p_head < rest:
@@ -368,7 +368,7 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         data.qvel[[plant.dof[plant.axes.index(n)] for n in order]] = state["velocity"]
         basis = motion_basis(plant.machine, plant.model, data)
         data.qvel[:] = basis @ data.qvel[independent_dofs(plant.machine, plant.model)]
-    for name in flexible_axes(plant.machine):
+    for name in axes_with_transmission(plant.machine):
         i = plant.axes.index(name)
         place, dof = plant.drive_qpos[i], plant.drive_dof[i]
         data.qpos[place] = state.get("drive", {}).get(name, data.qpos[place])
@@ -378,7 +378,7 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
             i = plant.axes.index(name)
             if i < plant.hydraulic:
                 if key.startswith("pressure") and value <= -ATMOSPHERE:  # of oil without free air
-                    value = pressure_with_air(value, plant.model.actuator_user[i, Slot.AIR_RELEASE])
+                    value = pressure_with_released_air(value, plant.model.actuator_user[i, Slot.AIR_RELEASE])
                 data.act[ACTIVATIONS_PER_AXIS * i + column] = value
     for name, place in plant.extra_states.items():
         kind, _, owner = name.partition(".")
@@ -430,12 +430,12 @@ def _evaluate_term_rows(user, terms, count, gain, time, act, x, v, command, out)
     for row in range(len(time)):
         supply = 0.0
         if count > 0:
-            compute_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
+            compute_inlet_conditions(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
             share = delivered_flow_fraction(user, 0, act[row])
             supply = circuit_supply_pressure(user, 0, count, scratch, share)
         drives = Drives(count, act[row], x[row], v[row], command[row])
         for i in range(len(gain)):
-            s = drive_state(
+            s = make_drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
                 gain[i],
             )  # fmt: skip
@@ -465,7 +465,7 @@ def term_forces_at_rest(
         return np.zeros(len(forces))
     act = np.zeros((1, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes) + len(extra_state_names(machine))))
     for i, axis in enumerate(machine.hydraulic_axes.values()):
-        act[0, ACTIVATIONS_PER_AXIS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
+        act[0, ACTIVATIONS_PER_AXIS * i + 2] = forces[i] / axis.hydraulic_drive.effective_areas[0]
     still = np.zeros((1, len(forces)))
     x = data.qpos[drive_qpos][None, :]
     return evaluate_terms(machine, np.zeros(1), act, x, still, still)[0, :, 0]

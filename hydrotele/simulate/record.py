@@ -31,12 +31,12 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     axis_flows_and_force,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     delivered_flow_fraction,
 )
 from hydrotele.simulate.closure import dependent_joints
 from hydrotele.simulate.layout import (
-    call_contact_force,
+    call_mj_contact_force,
     field_offsets,
     function_address,
     struct_size,
@@ -96,15 +96,15 @@ def start_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     mujoco.mj_integratePos(model, data.qpos, data.qvel, model.opt.timestep)
 
 
-def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+def current_aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the current positions (nq,), moved back by one step to the time of the activations.
 
     Positions from the first ball or free joint on (trees and logs) are not aligned.
     """
-    return align_positions(model, data.qpos, data.qvel)
+    return align_staggered_positions(model, data.qpos, data.qvel)
 
 
-def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+def align_staggered_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """Return staggered positions (..., nq), moved back by one step with the velocities (..., nv).
 
     This aligns them with the time of the activations, see the module.
@@ -214,7 +214,7 @@ def record_row(record, contacts, row, time):
     copy_values(matrix_view(r.to_act, r.rows, r.na)[row], act)
     if r.tip >= 0:
         copy_values(matrix_view(r.to_tip, r.rows, 3)[row], matrix_view(r.site, r.sites, 3)[r.tip])
-    _add_contact_forces(contacts[0], matrix_view(r.to_contact, r.rows, 3 * r.groups)[row])
+    _sum_contact_forces_by_group(contacts[0], matrix_view(r.to_contact, r.rows, 3 * r.groups)[row])
     warnings = int32_view(r.warning, 2 * _WARNING_COUNT)  # information and number of each
     for kind in range(_WARNING_COUNT):
         good = good and warnings[2 * kind + 1] == 0
@@ -244,28 +244,30 @@ class Recorder:
         late = any(error.is_delayed for error in plant.machine.sensor_errors.values())
         self.late = np.zeros((rows, len(sensed_channels(plant)) if late else 0))
 
-    def record_state(self, row: int, time: float, data: mujoco.MjData, shown: np.ndarray | None = None) -> None:
+    def record_state(
+        self, row: int, time: float, data: mujoco.MjData, delayed_readings: np.ndarray | None = None
+    ) -> None:
         """Record the current state; must be called before the next step.
 
         Args:
             row: index of the row.
             time: time of the row [s].
             data: staggered state after `start_leapfrog` or a step.
-            shown: (c,) delayed values of `sensed_channels`, if a sensor has a delay or lag.
+            delayed_readings: (c,) delayed values of `sensed_channels`, if a sensor has a delay or lag.
 
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo has issued a warning.
         """
         self.native_records(data)
-        if shown is not None:
-            self.record_sensor_values(row, shown)
+        if delayed_readings is not None:
+            self.record_sensor_values(row, delayed_readings)
         if not record_row(self._row, self._contacts, row, time):
             raise self.instability_error(row)
 
-    def record_sensor_values(self, row: int, shown: np.ndarray) -> None:
+    def record_sensor_values(self, row: int, delayed_readings: np.ndarray) -> None:
         """Record the delayed values (c,) of `sensed_channels`, if a sensor has a delay or lag."""
         if self.late.shape[1]:
-            self.late[row] = shown
+            self.late[row] = delayed_readings
 
     def native_records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Return the records for `record_row`: that of the recorder's arrays and that of the contacts.
@@ -316,16 +318,16 @@ class Recorder:
         )  # fmt: skip
 
 
-def surrounding_bodies(plant: Plant) -> np.ndarray:
+def mark_surrounding_bodies(plant: Plant) -> np.ndarray:
     """Return whether each body (nbody,) is the ground, fixed to it, or a surrounding object."""
     model = plant.model
     named = [is_surrounding_object(model.body(b).name) for b in range(model.nbody)]
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
 
 
-def surrounding_geoms(plant: Plant) -> np.ndarray:
+def mark_surrounding_geoms(plant: Plant) -> np.ndarray:
     """Return for each geom (ngeom,) 1 if it belongs to the ground or a surrounding object, else 0."""
-    return _geom_flags(plant.model, surrounding_bodies(plant))
+    return _geom_flags(plant.model, mark_surrounding_bodies(plant))
 
 
 def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -338,7 +340,7 @@ def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
         (ngeom,) group of each geom, 0 for the machine and k + 1 for the k-th name; and the names:
         `ground`, including fixed geoms, then every plate, tree, stump and log.
     """
-    model, numbers, names = plant.model, surrounding_geoms(plant), ["ground"]
+    model, numbers, names = plant.model, mark_surrounding_geoms(plant), ["ground"]
     for geom in np.flatnonzero(numbers):
         name, body = model.geom(geom).name, model.body(model.geom_bodyid[geom]).name
         thing = body if model.body_weldid[model.geom_bodyid[geom]] else name
@@ -359,7 +361,7 @@ def total_contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.n
     Args:
         model: the model.
         data: its data, with contacts and contact forces.
-        around: (nbody,) result of `surrounding_bodies`.
+        around: (nbody,) result of `mark_surrounding_bodies`.
     """
     total, around = np.zeros(3), _geom_flags(model, around)
     sum_contact_forces(contact_record(model, data, around), total)
@@ -380,7 +382,7 @@ def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarra
     Args:
         model: the model.
         data: its data; model and data must outlive the record.
-        around: (ngeom,) result of `surrounding_geoms`, which must outlive the record, too.
+        around: (ngeom,) result of `mark_surrounding_geoms`, which must outlive the record, too.
 
     Returns:
         (1,) record.
@@ -410,11 +412,11 @@ def sum_contact_forces(record, total):
 
     Source: `total_contact_force`.
     """
-    _add_contact_forces(record[0], total)
+    _sum_contact_forces_by_group(record[0], total)
 
 
 @compiled
-def _add_contact_forces(r, totals):
+def _sum_contact_forces_by_group(r, totals):
     """Write the sums of the contact forces on the machine per group, in the world frame.
 
     `totals` (3 n,) [N]: forces of group k are in the k-th triple; groups above n use the last one.
@@ -428,7 +430,7 @@ def _add_contact_forces(r, totals):
         first, second = around[geom[0]], around[geom[1]]
         if (first > 0) == (second > 0):
             continue  # contact within the machine or between surrounding objects
-        call_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
+        call_mj_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
         frame, sign = float64_view(contact + r.frame, 9), 1.0 if first > 0 else -1.0
         start = 3 * (min(max(first, second), groups) - 1)
         for i in range(3):
@@ -441,7 +443,7 @@ _SPOOL_CHANNELS = ("spool", "1"), ("spool_rate", "1/s")
 
 
 @compiled
-def state_supply(user, count, act, scratch):
+def state_supply_pressure(user, count, act, scratch):
     """Compute the supply pressure of the hydraulic circuit from the activations of a state.
 
     Args:
@@ -455,12 +457,12 @@ def state_supply(user, count, act, scratch):
 
     Source: nominal model, "Supply".
     """
-    compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+    compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
     return circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
 
 
 @compiled
-def state_flows(user, count, act, x, v):
+def compute_state_flows_and_forces(user, count, act, x, v):
     """Compute supply pressure, valve flows and drive forces of n states.
 
     Args:
@@ -479,7 +481,7 @@ def state_flows(user, count, act, x, v):
     scratch = np.zeros(SCRATCH_SIZE)
     out = np.zeros((act.shape[0], 1 + 3 * count))
     for row in range(act.shape[0]):
-        supply = state_supply(user, count, act[row], scratch)
+        supply = state_supply_pressure(user, count, act[row], scratch)
         out[row, 0] = supply
         for i in range(count):
             share = 0.0
@@ -563,32 +565,32 @@ def _unmeasured_channels(plant: Plant, record: Record):
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
 
-    def put(name: str, column: np.ndarray, unit: str) -> None:
+    def add_channel(name: str, column: np.ndarray, unit: str) -> None:
         values[name], units[name] = column, unit
 
     for i, name in enumerate(plant.axes):
         unit = "rad" if machine.position_kind(name) == "angle" else "m"
-        put(f"truth.velocity.{name}", record.qvel[:, plant.dof[i]], f"{unit}/s")
-        put(f"truth.acceleration.{name}", record.qacc[:, plant.dof[i]], f"{unit}/s^2")
+        add_channel(f"truth.velocity.{name}", record.qvel[:, plant.dof[i]], f"{unit}/s")
+        add_channel(f"truth.acceleration.{name}", record.qacc[:, plant.dof[i]], f"{unit}/s^2")
     driven = {axis.joint for axis in machine.axes.values()}
     for name, joint in machine.joints.items():
         if name not in driven and name not in dependent_joints(machine):
             kind, unit = ("angle", "rad") if joint.type == "hinge" else ("position", "m")
-            put(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
+            add_channel(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
     for name, place in plant.extra_states.items():
         shown = name.removesuffix(".supply")
-        put(f"truth.{shown}", record.act[:, place], "1")
-    _add_object_poses(plant, record, put)
-    _add_hydraulic_channels(plant, record, put)
+        add_channel(f"truth.{shown}", record.act[:, place], "1")
+    _add_object_poses(plant, record, add_channel)
+    _add_hydraulic_channels(plant, record, add_channel)
     for name, force in record.contact_of.items():
         if np.any(force):
             for letter, column in zip("xyz", force.T, strict=True):
-                put(f"truth.object_contact.{name}_{letter}", column, "N")
+                add_channel(f"truth.object_contact.{name}_{letter}", column, "N")
     for k, letter in enumerate("xyz"):
         if np.any(record.contact):
-            put(f"truth.contact_force.{letter}", record.contact[:, k], "N")
+            add_channel(f"truth.contact_force.{letter}", record.contact[:, k], "N")
         if record.tip.shape[1]:
-            put(f"truth.tip.{letter}", record.tip[:, k], "m")
+            add_channel(f"truth.tip.{letter}", record.tip[:, k], "m")
     return values, units
 
 
@@ -623,9 +625,9 @@ def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
     count = plant.hydraulic
     if not count:
         return
-    x, v = drive_motion(plant, record.qpos, record.qvel)
+    x, v = extract_drive_motion(plant, record.qpos, record.qvel)
     user = plant.model.actuator_user.ravel()
-    table = state_flows(user, count, np.ascontiguousarray(record.act), x, v)
+    table = compute_state_flows_and_forces(user, count, np.ascontiguousarray(record.act), x, v)
     if plant.machine.valve_axes:
         put("pressure_supply", table[:, 0], "Pa")
     more = evaluate_terms(plant.machine, record.time, record.act, x, v, record.command)
@@ -649,7 +651,7 @@ def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
         put("truth.flow_supply", total, "m^3/s")
 
 
-def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def extract_drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Select the drive positions and velocities from n complete states.
 
     Args:

@@ -84,7 +84,7 @@ class SoilBed:
         self.state, self.result, self.azimuth = make_bucket_state(), np.zeros(RESULT_SIZE), math.nan
 
     @property
-    def radii(self) -> np.ndarray:
+    def cell_radii(self) -> np.ndarray:
         """Radii of the centres of the cells (m,) [m]."""
         start, length = self.parameters[PROFILE_START], self.parameters[CELL_LENGTH]
         return start + length * (np.arange(len(self.surface)) + 0.5)

@@ -17,9 +17,9 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.hydraulics.circuit import SCRATCH_SIZE, SLOT_COUNT
 from hydrotele.machine.machine import Machine, SensorError, step_first_order_lag
-from hydrotele.simulate.layout import call_step, function_address
+from hydrotele.simulate.layout import call_mj_step, function_address
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import sensed_channels, split_delay, state_supply
+from hydrotele.simulate.record import sensed_channels, split_delay, state_supply_pressure
 
 
 class CommandDelayLine(NamedTuple):
@@ -112,7 +112,7 @@ SIMULATION_DTYPE = np.dtype(
 def simulation_record(sim: Simulation) -> np.ndarray:
     """Pack a Simulation into a (1,) record of sizes and array addresses, which is fast to pass.
 
-    The arrays must outlive the record. `read_simulation` unpacks it.
+    The arrays must outlive the record. `unpack_simulation_record` unpacks it.
     """
     line, past = sim.command_line, sim.sensor_history
     record = address_record(
@@ -136,7 +136,7 @@ def simulation_record(sim: Simulation) -> np.ndarray:
 
 
 @compiled
-def read_simulation(r):
+def unpack_simulation_record(r):
     """Unpack a record of `simulation_record` to a Simulation whose arrays share its memory."""
     k, c = r.axes, r.channels
     line = CommandDelayLine(matrix_view(r.line_ring, r.ticks, k), matrix_view(r.line_delay, k, 2))
@@ -164,7 +164,7 @@ def true_sensor_values(sim, out):
     Returns:
         Nothing.
 
-    Source: `simulate.record.aligned_positions` and `state_supply`.
+    Source: `simulate.record.aligned_positions` and `state_supply_pressure`.
     """
     k, h = sim.axes, sim.hydraulic
     for i in range(k):
@@ -173,7 +173,7 @@ def true_sensor_values(sim, out):
         out[k + 2 * i], out[k + 2 * i + 1] = sim.act[4 * i + 2], sim.act[4 * i + 3]
     at = k + 2 * h
     if h > 0:
-        out[at] = state_supply(sim.user, h, sim.act, np.empty(SCRATCH_SIZE))
+        out[at] = state_supply_pressure(sim.user, h, sim.act, np.empty(SCRATCH_SIZE))
         at += 1
     for i in range(len(sim.rod_qpos)):
         out[at + i] = sim.qpos[sim.rod_qpos[i]] - sim.timestep * sim.qvel[sim.rod_dof[i]]
@@ -201,7 +201,7 @@ def initialise_history(sim, command):
 
 
 @compiled
-def commands_of_step(line, axes, tick, step, steps, out):
+def compute_delayed_step_commands(line, axes, tick, step, steps, out):
     """Compute the delayed commands that act in one physics step.
 
     Args:
@@ -260,8 +260,8 @@ def step_physics(sim, tick, steps, command):
             line.ring[(tick + 1) % len(line.ring), i] = command[i]
     for step in range(steps):
         if len(line.ring) > 0:
-            commands_of_step(line, sim.axes, tick, step, steps, sim.ctrl)
-        call_step(sim.mj_step, sim.model, sim.data)
+            compute_delayed_step_commands(line, sim.axes, tick, step, steps, sim.ctrl)
+        call_mj_step(sim.mj_step, sim.model, sim.data)
         if len(past.ring) > 0:
             _store_sensor_values(sim, tick * steps + step + 1)
 
@@ -368,13 +368,13 @@ def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: 
         for tick, command in enumerate(held):
             line.ring[(tick + 1) % length] = command
             for step in range(steps):
-                commands_of_step(line, len(plant.axes), tick, step, steps, out[tick * steps + step])
+                compute_delayed_step_commands(line, len(plant.axes), tick, step, steps, out[tick * steps + step])
     return out
 
 
 @compiled
-def _step_record(record, tick, steps, command):
-    step_physics(read_simulation(record[0]), tick, steps, command)
+def _step_simulation_record(record, tick, steps, command):
+    step_physics(unpack_simulation_record(record[0]), tick, steps, command)
 
 
 class Stepper:
@@ -432,7 +432,7 @@ class Stepper:
 
     def advance(self, command: np.ndarray) -> None:
         """Advance the simulation by one control tick with a constant command (nu,) [1] or in drive units."""
-        _step_record(self.record, self.tick, self.steps, np.asarray(command, float))
+        _step_simulation_record(self.record, self.tick, self.steps, np.asarray(command, float))
         self.tick += 1
 
     def sensor_values(self) -> np.ndarray:

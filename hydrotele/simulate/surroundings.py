@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
@@ -73,7 +73,7 @@ def grip_parameters(
     )
 
 
-@allocation_free
+@compile_without_allocation
 def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle, held, row):
     """Decide whether a grab takes or releases an object, and set the weld that holds it.
 
@@ -131,7 +131,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
     return TAKEN
 
 
-@allocation_free
+@compile_without_allocation
 def _rotate_vector(w, x, y, z, vx, vy, vz):
     """Return the vector (vx, vy, vz), rotated by the unit quaternion (w, x, y, z)."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
@@ -183,9 +183,9 @@ def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject,
             assert machine.arm  # it has a bucket
             root.contact.add("exclude", name=f"soil_{number}", body1="world", body2=machine.arm.tip.link)
         else:
-            body = _write_log(root, f"log_{number}", thing, machine, where)
+            body = _add_timber_log(root, f"log_{number}", thing, machine, where)
             if visuals:
-                _draw_log(body, f"log_{number}", thing)
+                _add_timber_log_visuals(body, f"log_{number}", thing)
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
@@ -225,7 +225,7 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
     )  # fmt: skip
 
 
-def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
+def _add_timber_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
     """Add a timber log on the ground to the MJCF and return its body.
 
     Raises InputError if the axis `log.grab` or its pocket site is missing, or the log is too thick.
@@ -254,7 +254,7 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
     return body
 
 
-def _draw_log(body, name: str, log: LogOnGround) -> None:
+def _add_timber_log_visuals(body, name: str, log: LogOnGround) -> None:
     """Add the visual geometry (bark and wood) of a timber log to its body."""
     radius, half = log.diameter / 2.0, log.length / 2.0
     for part, size, reach, colour in (
@@ -315,7 +315,7 @@ def is_surrounding_object(name: str) -> bool:
     return name.startswith(_PREFIXES)
 
 
-def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
+def timber_log_grip_parameters(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Return the conditions under which a grab takes or releases a timber log, for `grip_step`.
 
     Args:
@@ -365,7 +365,7 @@ class Surroundings:
             if isinstance(thing, StandingTree)
         ]
         self._logs = [
-            _Gripper(machine, model, f"log_{n}", thing.grab, log_grip(model, thing))
+            _Gripper(machine, model, f"log_{n}", thing.grab, timber_log_grip_parameters(model, thing))
             for n, thing in enumerate(things)
             if isinstance(thing, LogOnGround)
         ]

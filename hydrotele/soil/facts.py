@@ -245,7 +245,7 @@ def make_level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.
     return np.full(count, float(height)), np.zeros(count)
 
 
-def soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
+def total_soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
     """Return the soil mass [kg]: on the ground above height 0, in the bucket, and fallen off the ends of the profile.
 

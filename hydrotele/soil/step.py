@@ -20,7 +20,7 @@ the surface and load it with the weight Q of the soil in the bucket. All angles 
 import math
 from typing import NamedTuple
 
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.soil.facts import (
     ADHESION,
     BUCKET_SIZE,
@@ -68,11 +68,11 @@ from hydrotele.soil.facts import (
     TOOL_FRICTION,
     WIDTH,
 )
-from hydrotele.soil.terrain import cut_cells, find_cell, lay_down, slide_cells, surface_height
+from hydrotele.soil.terrain import add_loose_soil, cut_cells, find_cell_at_radius, slide_soil_in_range, surface_height
 
 
-@allocation_free
-def compute_held_soil(n, attitude, level, out):
+@compile_without_allocation
+def compute_bucket_capacity(n, attitude, level, out):
     """Compute the maximum volume of soil that a bucket holds at an attitude, and the centre of this soil.
 
     The soil fills the bucket below a surface at the angle of repose, which rises from the lower rim
@@ -159,7 +159,7 @@ MAX_SLOPE_RATIO = 0.6  # maximum slope as a fraction of the friction angle
 _MIN_SQUARE = 0.05  # lower bound that avoids jamming of nearly parallel blade and surface
 
 
-@allocation_free
+@compile_without_allocation
 def failure_plane_angle(rake, slope, friction, tool_friction):
     """Return the angle between the surface and the plane along which a blade shears off the soil.
 
@@ -191,7 +191,7 @@ def failure_plane_angle(rake, slope, friction, tool_friction):
     return min(max(plane, math.radians(5.0)), math.radians(85.0))
 
 
-@allocation_free
+@compile_without_allocation
 def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
     """Return the factor N_g of the blade force that is due to the weight of the soil wedge.
 
@@ -219,7 +219,7 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
     return 0.5 * top * surcharge_factor(rake, slope, friction, tool_friction, plane)
 
 
-@allocation_free
+@compile_without_allocation
 def surcharge_factor(rake, slope, friction, tool_friction, plane):
     """Return the factor N_q: blade force due to a load on the soil wedge, divided by this load.
 
@@ -238,7 +238,7 @@ def surcharge_factor(rake, slope, friction, tool_friction, plane):
     return math.sin(plane + friction + slope) / math.sin(rake + tool_friction + friction + plane)
 
 
-@allocation_free
+@compile_without_allocation
 def cohesion_factor(rake, friction, tool_friction, plane):
     """Return the factor N_c of the blade force that is due to cohesion on the failure plane.
 
@@ -259,7 +259,7 @@ def cohesion_factor(rake, friction, tool_friction, plane):
     return math.cos(friction) / (math.sin(plane) * math.sin(fan))
 
 
-@allocation_free
+@compile_without_allocation
 def adhesion_factor(rake, friction, tool_friction, plane):
     """Return the factor N_ca of the blade force that is due to adhesion of soil to the blade.
 
@@ -280,7 +280,7 @@ def adhesion_factor(rake, friction, tool_friction, plane):
     return -math.cos(rake + friction + plane) / (math.sin(rake) * math.sin(fan))
 
 
-@allocation_free
+@compile_without_allocation
 def bearing_pressure(overburden, cohesion, friction, tilt):
     """Return the pressure at which soil yields under a smooth face that is pushed into it.
 
@@ -305,8 +305,8 @@ def bearing_pressure(overburden, cohesion, friction, tilt):
     return (overburden + cohesion / t) * factor - cohesion / t
 
 
-@allocation_free
-def limit_rake(rake, slope, friction, tool_friction):
+@compile_without_allocation
+def limit_rake_angle(rake, slope, friction, tool_friction):
     """Return the rake of the blade relative to the surface, limited to the valid range of the wedge equation.
 
     A wedge of soil sticks to a blade that is steeper than upright, or too steep for its friction
@@ -327,8 +327,8 @@ def limit_rake(rake, slope, friction, tool_friction):
     return min(max(rake + slope, MIN_RAKE), steepest)
 
 
-@allocation_free
-def limit_slope(slope, friction):
+@compile_without_allocation
+def limit_surface_slope(slope, friction):
     """Return the slope of the surface, limited to the range in which a failure plane can form.
 
     Args:
@@ -353,7 +353,7 @@ SLIDE_SWEEPS = 2  # sweeps of sliding soil per step
 EARTH_PRESSURE_RATIO = 0.5  # ratio of horizontal to vertical pressure next to a blade
 
 
-@allocation_free
+@compile_without_allocation
 def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     """Compute the force of the soil on a blade that is drawn towards the machine.
 
@@ -375,8 +375,8 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     if depth <= 0.0:
         return
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
-    slope = limit_slope(slope, phi)
-    rake = limit_rake(rake, slope, phi, delta)
+    slope = limit_surface_slope(slope, phi)
+    rake = limit_rake_angle(rake, slope, phi, delta)
     plane = failure_plane_angle(rake, slope, phi, delta)
     across = depth * math.cos(slope)
     bank = min(max(depth - loose, 0.0), depth) * math.cos(slope)
@@ -393,8 +393,8 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     out[1] = -force * math.cos(upright + delta) + stuck * math.sin(upright) / math.sin(rake)
 
 
-@allocation_free
-def update_yielding_force(n, state, place, along, rate, low, high):
+@compile_without_allocation
+def update_elastic_plastic_force(n, state, deflection_index, displacement, rate, low, high):
     """Return the force of the soil on one surface of the bucket, from an elastic-plastic spring and a damper.
 
     The spring deflects as the surface moves into the soil and yields at the limit forces of soil
@@ -403,8 +403,8 @@ def update_yielding_force(n, state, place, along, rate, low, high):
     Args:
         n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         state: (STATE_SIZE,) of the bucket; its deflection is changed [m].
-        place: index of the deflection in the state, scalar [1].
-        along: displacement of the surface into the soil since the last step, scalar [m].
+        deflection_index: index of the deflection in the state, scalar [1].
+        displacement: displacement of the surface into the soil since the last step, scalar [m].
         rate: rate of this displacement, scalar [m/s].
         low: minimum force, at most 0, scalar [N].
         high: maximum force, at least 0, scalar [N].
@@ -415,21 +415,21 @@ def update_yielding_force(n, state, place, along, rate, low, high):
     Source: Prandtl's elastic-plastic element; it returns at most the energy of the spring.
     """
     k = n[STIFFNESS]
-    spring = min(max(k * (state[place] + along), low), high)
-    state[place] = spring / k
+    spring = min(max(k * (state[deflection_index] + displacement), low), high)
+    state[deflection_index] = spring / k
     return min(max(spring + n[DAMPING] * rate, low), high)
 
 
-@allocation_free
+@compile_without_allocation
 def _drop_soil(n, surface, loose, state, first, second, volume):
-    lost = lay_down(n, surface, loose, first, 0.5 * volume)
-    lost += lay_down(n, surface, loose, second, 0.5 * volume)
+    lost = add_loose_soil(n, surface, loose, first, 0.5 * volume)
+    lost += add_loose_soil(n, surface, loose, second, 0.5 * volume)
     state[LOST_VOLUME] += lost
-    _mark_cells(state, min(first, second), max(first, second), len(surface))
+    _mark_sliding_cells(state, min(first, second), max(first, second), len(surface))
 
 
-@allocation_free
-def _mark_cells(state, low, high, count):
+@compile_without_allocation
+def _mark_sliding_cells(state, low, high, count):
     """Add the cells `low` to `high` and their neighbours to the range in which soil may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
     if state[LAST_SLIDING_CELL] <= state[FIRST_SLIDING_CELL]:
@@ -459,8 +459,8 @@ class EdgeMotion(NamedTuple):
     attitude: float
 
 
-@allocation_free
-def _compute_forces(n, surface, loose, state, edge, dt, out):
+@compile_without_allocation
+def _compute_bucket_forces(n, surface, loose, state, edge, dt, out):
     """Write the soil force on all surfaces of the bucket and its moment; return the depth of the edge in the soil.
 
     Returns:
@@ -483,7 +483,7 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
         compute_cutting_force(n, inside, over, rake, slope, load, out)
         limit = math.hypot(out[0], out[1])
         ar, az = (out[0] / limit, out[1] / limit) if limit > 0.0 else (1.0, 0.0)
-        f = update_yielding_force(n, state, FACE, -dr * ar - dz * az, -r_rate * ar - z_rate * az, 0.0,
+        f = update_elastic_plastic_force(n, state, FACE, -dr * ar - dz * az, -r_rate * ar - z_rate * az, 0.0,
                            limit)  # fmt: skip
         out[0], out[1] = f * ar, f * az
     else:
@@ -501,7 +501,7 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
         rub = 2.0 * n[WIDTH] * contact * shear
         sharp = n[EDGE_THICKNESS] * n[WIDTH] * min(deepest / n[EDGE_THICKNESS], 1.0)
         push = sharp * bearing_pressure(weight * deepest, n[COHESION], phi, 0.0) + rub
-        f = update_yielding_force(n, state, TIP, -dr * c - dz * s, -r_rate * c - z_rate * s, -rub, push)
+        f = update_elastic_plastic_force(n, state, TIP, -dr * c - dz * s, -r_rate * c - z_rate * s, -rub, push)
         out[0] += f * c
         out[1] += f * s
         yield_at = 0.0
@@ -509,7 +509,7 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
             contact = min(outside / max(s, 0.1), n[FLOOR_LENGTH])
             pressure = bearing_pressure(0.5 * weight * outside, n[COHESION], phi, tilt)
             yield_at = pressure * contact * n[WIDTH]
-        f = update_yielding_force(n, state, FLOOR, dr * s - dz * c, r_rate * s - z_rate * c, 0.0,
+        f = update_elastic_plastic_force(n, state, FLOOR, dr * s - dz * c, r_rate * s - z_rate * c, 0.0,
                            yield_at)  # fmt: skip
         out[0] -= f * s
         out[1] += f * c
@@ -524,9 +524,9 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
         dr, dz = heel_r - state[LAST_HEEL_R], heel_z - state[LAST_HEEL_Z]
         contact = min(4.0 * deep, MAX_HEEL_CONTACT)
         pressure = bearing_pressure(0.5 * n[DENSITY] * n[GRAVITY_INDEX] * deep, n[COHESION], phi, 0.0)
-        up = update_yielding_force(n, state, HEEL, -dz, -dz / dt, 0.0, pressure * contact * n[WIDTH])
+        up = update_elastic_plastic_force(n, state, HEEL, -dz, -dz / dt, 0.0, pressure * contact * n[WIDTH])
         rub = up * math.tan(delta)
-        back = update_yielding_force(n, state, SLIDE, -dr, -dr / dt, -rub, rub)
+        back = update_elastic_plastic_force(n, state, SLIDE, -dr, -dr / dt, -rub, rub)
         out[0] += back
         out[1] += up
         out[2] = from_edge_r * up - from_edge_z * back
@@ -537,7 +537,7 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
     return inside, outside
 
 
-@allocation_free
+@compile_without_allocation
 def step_soil(n, surface, loose, state, edge, dt, out):
     """Advance soil and bucket by one time step: force, cutting, filling, spilling and sliding.
 
@@ -570,10 +570,10 @@ def step_soil(n, surface, loose, state, edge, dt, out):
         state[LAST_HEEL_Z] = z + n[HEEL_X] * s + n[HEEL_Z] * c
         state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = 0.0, len(surface) - 1.0
     z_before, count = state[LAST_Z], len(surface)
-    inside, outside = _compute_forces(n, surface, loose, state, edge, dt, out)
+    inside, outside = _compute_bucket_forces(n, surface, loose, state, edge, dt, out)
     state[DEPTH] = max(inside, 0.0)
     force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
-    here = find_cell(n, r)
+    here = find_cell_at_radius(n, r)
     wall = here if inside > 0.0 or outside > 0.0 else -2  # cell that contains the bucket
     taken, pushed = 0.0, 0.0
     if r < state[CUT_FRONT]:
@@ -586,7 +586,7 @@ def step_soil(n, surface, loose, state, edge, dt, out):
         _drop_soil(n, surface, loose, state, here + 1, here + 2, pushed)
     state[CARRIED_VOLUME] += taken
     if state[CARRIED_VOLUME] > 0.0:
-        compute_held_soil(n, attitude, max(inside, 0.0), out)
+        compute_bucket_capacity(n, attitude, max(inside, 0.0), out)
         most, rim = out[0], out[3]
         centre_r, centre_z = out[1], out[2]
         excess = state[CARRIED_VOLUME] - most
@@ -596,19 +596,19 @@ def step_soil(n, surface, loose, state, edge, dt, out):
                 _drop_soil(n, surface, loose, state, here - 1, here - 2, falls)
             else:
                 falls = min(excess, (excess / SPILL_TIME + MIN_SPILL_RATE) * dt)
-                below = find_cell(n, r + rim)
+                below = find_cell_at_radius(n, r + rim)
                 _drop_soil(n, surface, loose, state, below, below - 1, falls)
             state[CARRIED_VOLUME] -= falls
         out[MASS] = state[CARRIED_VOLUME] / n[SWELL] * n[DENSITY]
         out[MASS_R], out[MASS_Z] = centre_r, centre_z
     out[FORCE_R], out[FORCE_Z], out[MOMENT] = force_r, force_z, moment
     if wall > -2:
-        _mark_cells(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
+        _mark_sliding_cells(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
     if state[LAST_SLIDING_CELL] > state[FIRST_SLIDING_CELL]:
         slid = False
         low, high = int(state[FIRST_SLIDING_CELL]), int(state[LAST_SLIDING_CELL])
         for _ in range(SLIDE_SWEEPS):
-            slid |= slide_cells(n, surface, loose, low, high, wall)
+            slid |= slide_soil_in_range(n, surface, loose, low, high, wall)
         if slid:
             state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = (
                 max(low - 1, 0),
@@ -618,7 +618,7 @@ def step_soil(n, surface, loose, state, edge, dt, out):
             state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = 0.0, 0.0
 
 
-@allocation_free
+@compile_without_allocation
 def compute_bucket_wrench(out, edge, theta, centre, wrench):
     """Compute the wrench of the soil and of the carried load on the bucket's body.
 

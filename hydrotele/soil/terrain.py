@@ -8,13 +8,13 @@ its ends, so that mass is conserved.
 
 import math
 
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.soil.facts import CELL_LENGTH, CUT_SLOPE, PROFILE_START, REPOSE, SWELL, WIDTH
 
 MIN_SLIDING_HEIGHT = 1e-4  # m, height difference above the stable one at which soil does not slide
 
 
-@allocation_free
+@compile_without_allocation
 def surface_height(n, surface, r):
     """Return the height of the soil surface at a radius.
 
@@ -40,7 +40,7 @@ def surface_height(n, surface, r):
     return surface[i] + (place - i) * (surface[i + 1] - surface[i])
 
 
-@allocation_free
+@compile_without_allocation
 def cut_cells(n, surface, loose, r0, z0, r1, z1):
     """Remove the soil above the path of the bucket's edge from the cells that the edge sweeps in a step.
 
@@ -86,8 +86,8 @@ def cut_cells(n, surface, loose, r0, z0, r1, z1):
     return taken * n[CELL_LENGTH] * n[WIDTH]
 
 
-@allocation_free
-def lay_down(n, surface, loose, cell, volume):
+@compile_without_allocation
+def add_loose_soil(n, surface, loose, cell, volume):
     """Add a volume of loose soil to the top of a cell.
 
     Args:
@@ -110,8 +110,8 @@ def lay_down(n, surface, loose, cell, volume):
     return 0.0
 
 
-@allocation_free
-def find_cell(n, r):
+@compile_without_allocation
+def find_cell_at_radius(n, r):
     """Return the index of the cell at a radius; outside the profile it is negative or too large.
 
     Args:
@@ -126,8 +126,8 @@ def find_cell(n, r):
     return int(math.floor((r - n[PROFILE_START]) / n[CELL_LENGTH]))
 
 
-@allocation_free
-def slide_pair(n, surface, loose, upper, lower):
+@compile_without_allocation
+def slide_soil_between_cells(n, surface, loose, upper, lower):
     """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
 
     Args:
@@ -163,8 +163,8 @@ def slide_pair(n, surface, loose, upper, lower):
     return moved > 0.0
 
 
-@allocation_free
-def slide_cells(n, surface, loose, low, high, wall):
+@compile_without_allocation
+def slide_soil_in_range(n, surface, loose, low, high, wall):
     """Let the soil of a range of cells slide in one forward and one backward sweep.
 
     Args:
@@ -185,14 +185,14 @@ def slide_cells(n, surface, loose, low, high, wall):
     for i in range(low, high):
         if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
-                slid |= slide_pair(n, surface, loose, i, i + 1)
+                slid |= slide_soil_between_cells(n, surface, loose, i, i + 1)
             else:
-                slid |= slide_pair(n, surface, loose, i + 1, i)
+                slid |= slide_soil_between_cells(n, surface, loose, i + 1, i)
     for j in range(low, high):
         i = high - 1 - (j - low)
         if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
-                slid |= slide_pair(n, surface, loose, i, i + 1)
+                slid |= slide_soil_between_cells(n, surface, loose, i, i + 1)
             else:
-                slid |= slide_pair(n, surface, loose, i + 1, i)
+                slid |= slide_soil_between_cells(n, surface, loose, i + 1, i)
     return slid

@@ -88,12 +88,12 @@ class TeleoperatorAxis:
         """Return a copy of the axis with the same delay [s] in each direction."""
         return replace(self, delay_forward=delay, delay_back=delay)
 
-    def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+    def make_port(self, structure: str, return_gain: float = 1.0) -> TwoPort:
         """Return the linear two-port of this axis with a given control structure.
 
         Args:
             structure: name, one of `STRUCTURES`, such as `position_force`.
-            reflected: factor on both return channels, force C2 and velocity C4, which is the gain of
+            return_gain: factor on both return channels, force C2 and velocity C4, which is the gain of
                 the loop through hand and task [1].
 
         Returns:
@@ -106,12 +106,12 @@ class TeleoperatorAxis:
             structure, self.master, self.slave, self.master_control, self.slave_control,
             self.gains, delay_forward=self.delay_forward, delay_back=self.delay_back,
         )  # fmt: skip
-        if reflected == 1.0:
+        if return_gain == 1.0:
             return made
         return replace(
             made,
-            force_back=_scale_block(made.force_back, reflected),
-            velocity_back=_scale_block(made.velocity_back, reflected),
+            force_back=_scale_block(made.force_back, return_gain),
+            velocity_back=_scale_block(made.velocity_back, return_gain),
         )
 
 
@@ -206,7 +206,7 @@ class StiffnessFeedbackAxis(StrictModel):
             )
         return self
 
-    def to_spring(self) -> StiffnessAxis:
+    def to_stiffness_axis(self) -> StiffnessAxis:
         """Convert the data of the file to a `StiffnessAxis`, which tests the stability theorem."""
         return StiffnessAxis(self.mass, self.damping, self.nominal_stiffness, self.min_stiffness, self.max_stiffness)
 
@@ -350,10 +350,10 @@ class StabilityLoop(Protocol):
         """Return a copy of the loop with the same delay [s] in each direction."""
         ...
 
-    def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+    def make_port(self, structure: str, return_gain: float = 1.0) -> TwoPort:
         """Return the linear two-port with a control structure.
 
-        `reflected` is a factor on the channels from the slave to the master [1].
+        `return_gain` is a factor on the channels from the slave to the master [1].
         """
         ...
 
@@ -432,13 +432,13 @@ def analyse_structure(
     Source: Zhu 1994, chapter 3.
     """
     port, s = case.make_port(structure), 1j * np.asarray(frequencies, float)
-    unit = reference_impedance(case)
+    unit = scattering_reference_impedance(case)
     return StructureAnalysis(
         structure, frequencies, hybrid_matrix(port, s), transmitted_impedance(port, s, case.task), case.task(s),
         scattering_norm(port, s, unit), loop_gain(port, s, case.hand, case.task),
         loop_gain(port, s, case.hand, _ZERO_IMPEDANCE), _count_poles_or_none(port, case.hand, case.task),
         _count_poles_or_none(port, case.hand, _ZERO_IMPEDANCE), _count_poles_or_none(port, _ZERO_IMPEDANCE, case.task),
-        _count_poles_or_none(port, _ZERO_IMPEDANCE, _ZERO_IMPEDANCE), gain_margin(case, structure),
+        _count_poles_or_none(port, _ZERO_IMPEDANCE, _ZERO_IMPEDANCE), find_gain_margin(case, structure),
         find_max_delay(case, structure), is_passive(port, unit),
     )  # fmt: skip
 
@@ -466,7 +466,7 @@ def loop_gain(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: 
     return (c2 * environment(s) + c4) * (c1 - c3 * hand(s)) / (near * far)
 
 
-def reference_impedance(case: TeleoperatorAxis) -> float:
+def scattering_reference_impedance(case: TeleoperatorAxis) -> float:
     """Return a reference impedance for scattering matrices: `sqrt(B^2 + M K)` of the hand [N s/m].
 
     M, B and K are the hand's mass, damping and stiffness. The result is 1 if this is zero.
@@ -516,7 +516,7 @@ def _count_poles_or_none(port: TwoPort, hand: Block, environment: Block) -> int 
         return None
 
 
-def gain_margin(case: StabilityLoop, structure: str) -> float:
+def find_gain_margin(case: StabilityLoop, structure: str) -> float:
     """Return the factor on the return channels at which stability changes [1].
 
     For a stable case it is the largest stable factor, infinite if all factors up to 1000 are stable.

@@ -75,7 +75,7 @@ def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[
             pilot.force_limit or law.force_limit, lever**2 * (pilot.wave_impedance or damped),
         )  # fmt: skip
     _assign_coordinates(pilot, table, coordinates)
-    _check_goals(pilot, table, coordinates)
+    _check_operator_goals(pilot, table, coordinates)
     return table
 
 
@@ -116,7 +116,7 @@ def _merge_gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains
     return validate_data(AxisGains, kept | own, f"pilot.stiffness.{name}", {})
 
 
-def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
+def _check_operator_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
     """Raise InputError if the simulated operator's target is a coordinate that cannot be moved.
 
     The arm must have the coordinate, and the dead band must not cover the range of its joystick axis.
@@ -139,7 +139,7 @@ def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, 
 StateType = TypeVar("StateType", bound=tuple[Any, ...])
 
 
-def make_flat_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> StateType:
+def make_contiguous_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> StateType:
     """Create a named tuple of zero arrays that together are one contiguous block of memory.
 
     Args:
@@ -158,21 +158,21 @@ def make_flat_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> Sta
     ))  # fmt: skip
 
 
-def flatten_state(parts: StateType) -> StateType:
+def copy_to_contiguous_state(parts: StateType) -> StateType:
     """Copy a named tuple of arrays, as floats, into one contiguous block of memory.
 
     Returns:
         A tuple of the same type and shapes; `flat_view` returns its memory as one array.
     """
     arrays = [np.asarray(part, float) for part in parts]
-    made = make_flat_state(type(parts), [array.shape for array in arrays])
+    made = make_contiguous_state(type(parts), [array.shape for array in arrays])
     for place, array in zip(made, arrays, strict=True):
         place[...] = array
     return made
 
 
 def flat_view(parts: tuple[Any, ...]) -> np.ndarray:
-    """Return the memory of a tuple of `make_flat_state` or `flatten_state` as one 1-D array.
+    """Return the memory of a tuple of `make_contiguous_state` or `copy_to_contiguous_state` as one 1-D array.
 
     It is a view: changes of the array change the parts of the tuple.
     """

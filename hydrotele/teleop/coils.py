@@ -135,12 +135,12 @@ def make_three_station_coils(radius: float, force_per_ampere: float, max_current
     return Coils(np.vstack([places, places]), np.vstack([up, around]), force_per_ampere, max_current)
 
 
-def relative_heating(currents: np.ndarray, continuous: float) -> float:
+def relative_heating(currents: np.ndarray, max_continuous_current: float) -> float:
     """Return the steady-state temperature rise of the hottest coil, relative to its permitted rise.
 
     Args:
         currents: (6,) constant or root-mean-square currents [A].
-        continuous: maximum continuous current [A].
+        max_continuous_current: maximum continuous current [A].
 
     Returns:
         Ratio [1]; above 1 the coils overheat.
@@ -148,15 +148,15 @@ def relative_heating(currents: np.ndarray, continuous: float) -> float:
     >>> relative_heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
     4.0
     """
-    return float(np.max(np.square(np.asarray(currents, float) / continuous)))
+    return float(np.max(np.square(np.asarray(currents, float) / max_continuous_current)))
 
 
-def time_to_overheat(currents: np.ndarray, continuous: float, time_constant: float) -> float:
+def time_to_overheat(currents: np.ndarray, max_continuous_current: float, time_constant: float) -> float:
     """Return the time after which cold coils reach their permitted temperature at given currents.
 
     Args:
         currents: (6,) constant currents [A].
-        continuous: maximum continuous current [A].
+        max_continuous_current: maximum continuous current [A].
         time_constant: thermal time constant of the winding [s].
 
     Returns:
@@ -167,5 +167,5 @@ def time_to_overheat(currents: np.ndarray, continuous: float, time_constant: flo
     >>> round(time_to_overheat(np.full(6, 4.0), 2.0, 60.0), 3)
     17.261
     """
-    end = relative_heating(currents, continuous)
+    end = relative_heating(currents, max_continuous_current)
     return float(-time_constant * np.log1p(-1.0 / end)) if end > 1.0 else float("inf")

@@ -230,7 +230,7 @@ def compliance_wrench(
     place = motion.position + turn @ centre
     speed = motion.velocity + turn @ np.cross(w, centre)
     wanted = spring[:3] * (target - place) - damper[:3] * speed
-    scalar, vector = rotation_between(target_rotation, motion.quaternion)
+    scalar, vector = relative_quaternion(target_rotation, motion.quaternion)
     vector_rate = 0.5 * (scalar * w + np.cross(vector, w))
     scalar_rate = -0.5 * vector @ w
     swing = -spring[3:] * vector - damper[3:] * vector_rate
@@ -248,7 +248,7 @@ def _skew_matrix(v: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-def rotation_between(first: np.ndarray, then: np.ndarray) -> tuple[float, np.ndarray]:
+def relative_quaternion(first: np.ndarray, then: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the quaternion of the rotation from one orientation to another, by at most 180 degrees.
 
     Args:

@@ -33,8 +33,8 @@ from hydrotele.teleop.analysis import (
     StructureAnalysis,
     TeleoperatorAxis,
     analyse_structure,
+    find_gain_margin,
     find_max_delay,
-    gain_margin,
     loop_gain,
     stability_map,
 )
@@ -97,13 +97,13 @@ class SimulatedRun(NamedTuple):
     impedance: complex
 
 
-def control_law(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> ControlLaw:
+def build_control_law(case: TeleoperatorAxis, structure: str, return_gain: float = 1.0) -> ControlLaw:
     """Return the control law of a structure as coefficients on time signals.
 
     Args:
         case: parameters of the teleoperator axis.
         structure: name, one of `STRUCTURES`.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         Coefficients of the control law.
@@ -112,33 +112,33 @@ def control_law(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) 
     """
     kv, gains = case.gains.velocity, case.gains
     rate = structure in ("rate_position", "rate_force", "four_channel_rate")
-    forward = motion_coefficients(case.slave_control, INT if rate else X) * (kv if rate else gains.position)
-    own, back = motion_coefficients(case.master_control, X), np.zeros(10)
+    forward = impedance_coefficients(case.slave_control, INT if rate else X) * (kv if rate else gains.position)
+    own, back = impedance_coefficients(case.master_control, X), np.zeros(10)
     if structure in ("rate_position", "four_channel_rate"):
-        own = kv * motion_coefficients(case.master_control, INT)
+        own = kv * impedance_coefficients(case.master_control, INT)
     if structure in ("position_position", "rate_position", "four_channel_rate"):
-        back = -motion_coefficients(case.master_control, Y)
+        back = -impedance_coefficients(case.master_control, Y)
     if structure in ("position_force", "rate_force"):
-        back = gains.force * motion_coefficients(case.task, Y)
+        back = gains.force * impedance_coefficients(case.task, Y)
     if structure == "four_channel_position":
-        forward = motion_coefficients(case.slave, X) + motion_coefficients(case.slave_control, X)
+        forward = impedance_coefficients(case.slave, X) + impedance_coefficients(case.slave_control, X)
         forward[FORCE] = 1.0
-        back = motion_coefficients(case.task, Y) - motion_coefficients(case.master, Y)
-        back -= motion_coefficients(case.master_control, Y)
+        back = impedance_coefficients(case.task, Y) - impedance_coefficients(case.master, Y)
+        back -= impedance_coefficients(case.master_control, Y)
     if structure == "four_channel_rate":
         forward[IMPULSE] = kv
-        back = back + motion_coefficients(case.task, W) / kv
-    return ControlLaw(own, forward, reflected * back)
+        back = back + impedance_coefficients(case.task, W) / kv
+    return ControlLaw(own, forward, return_gain * back)
 
 
-def motion_coefficients(impedance: Impedance, position: int) -> np.ndarray:
+def impedance_coefficients(impedance: Impedance, position_index: int) -> np.ndarray:
     """Return the coefficients (10,) with which an impedance acts on a motion, as a force.
 
-    Stiffness, damping and mass multiply the signals `position`, `position + 1` and `position + 2`:
+    Stiffness, damping and mass multiply the signals `position_index`, `position + 1` and `position + 2`:
     a position and its two derivatives.
     """
     made = np.zeros(10)
-    made[position : position + 3] = impedance.stiffness, impedance.damping, impedance.mass
+    made[position_index : position_index + 3] = impedance.stiffness, impedance.damping, impedance.mass
     return made
 
 
@@ -166,15 +166,15 @@ def choose_time_step(case: TeleoperatorAxis) -> float:
     return step
 
 
-def simulate_impulse(
-    case: TeleoperatorAxis, structure: str, reflected: float = 1.0, seconds: float = 40.0
+def simulate_impulse_response(
+    case: TeleoperatorAxis, structure: str, return_gain: float = 1.0, seconds: float = 40.0
 ) -> SimulatedRun:
     """Simulate the response to an initial velocity of the master, with hand and task.
 
     Args:
         case: teleoperator with hand and task.
         structure: name of the structure.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
         seconds: duration, at least forty round-trip delays; the run stops earlier when the motion
             has decayed or has grown without bound.
 
@@ -182,7 +182,7 @@ def simulate_impulse(
         Largest speeds over the run; `is_growing` evaluates them.
     """
     seconds = max(seconds, _MIN_ROUND_TRIPS * 2.0 * case.delay)
-    return _simulate_case(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
+    return _simulate_case(case, build_control_law(case, structure, return_gain), seconds, 0.0, 0.0)
 
 
 def is_growing(run: SimulatedRun) -> bool:
@@ -196,7 +196,7 @@ def is_growing(run: SimulatedRun) -> bool:
     return bool(run.max_speeds[-4:].max() > run.max_speeds[4:8].max())
 
 
-def simulate_sine(case: TeleoperatorAxis, structure: str, frequency: float) -> complex:
+def measure_sine_impedance(case: TeleoperatorAxis, structure: str, frequency: float) -> complex:
     """Measure in simulation the impedance that an operator feels at the master at one frequency.
 
     The master's motion is an imposed sine. The settling time is doubled until the result no longer
@@ -210,7 +210,7 @@ def simulate_sine(case: TeleoperatorAxis, structure: str, frequency: float) -> c
     Returns:
         Complex ratio of hand force to velocity, measured over two periods [N s/m].
     """
-    law, period = control_law(case, structure), 2.0 * math.pi / frequency
+    law, period = build_control_law(case, structure), 2.0 * math.pi / frequency
     felt = 0.0
     for settle in _SETTLING_TIMES:
         before, seconds = felt, (math.ceil(settle / period) + _MEASURED_PERIODS) * period
@@ -254,16 +254,16 @@ def _build_equations(
         Coefficients (4, 10) on the present signals, and (4, 20) on the delayed ones: ten delayed by
         the forward channel, then ten by the return channel.
     """
-    own = motion_coefficients(case.master, X) + law.master_own
+    own = impedance_coefficients(case.master, X) + law.master_own
     own[FORCE] -= 1.0
-    hand = motion_coefficients(case.hand, X)
+    hand = impedance_coefficients(case.hand, X)
     hand[FORCE] = 1.0
     if imposed:
         hand = np.eye(10)[A]
     slave = (
-        motion_coefficients(case.slave, Y)
-        + motion_coefficients(case.slave_control, Y)
-        + motion_coefficients(case.task, Y)
+        impedance_coefficients(case.slave, Y)
+        + impedance_coefficients(case.slave_control, Y)
+        + impedance_coefficients(case.task, Y)
     )
     jerk, still = np.eye(10)[W2], np.zeros(10)
     if law.back[W2]:
@@ -272,11 +272,11 @@ def _build_equations(
     there, here = np.array([still, still, law.forward, still]), np.zeros((4, 10))
     there[:2] = 0.0
     here[0] = -law.back
-    there, here = _fold_undelayed(there, here, now, lags)
+    there, here = _move_undelayed_coefficients(there, here, now, lags)
     return now, np.hstack([there, here])
 
 
-def _fold_undelayed(
+def _move_undelayed_coefficients(
     there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Subtract the coefficients of channels without delay from those of the present signals `now`.
@@ -310,7 +310,7 @@ def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured,
             q[INT], q[X] = -math.cos(angle) / frequency, math.sin(angle)
             q[V] = frequency * math.cos(angle)
         _interpolate_delayed(past, n, lags, beyond, late)
-        _solve(q, late, inverse, known, delayed, frequency)
+        _solve_accelerations_and_force(q, late, inverse, known, delayed, frequency)
         past[n % len(past)] = q
         block = n * _BLOCKS // rows
         largest[block] = max(largest[block], abs(q[V]) + abs(q[W]))
@@ -324,7 +324,7 @@ def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured,
                 or not largest[block - 1] < _MAX_SPEED_RATIO * _INITIAL_SPEED
             ):
                 break
-        _advance(q, before, step, n == 0)
+        _advance_motion_signals(q, before, step, n == 0)
     return largest, sums
 
 
@@ -340,7 +340,7 @@ def _interpolate_delayed(past, n, lags, beyond, late):
 
 
 @compiled
-def _solve(q, late, inverse, known, delayed, frequency):
+def _solve_accelerations_and_force(q, late, inverse, known, delayed, frequency):
     """Solve for both accelerations, the hand's force and the slave's jerk; write them to q (10,)."""
     for i in range(4):
         total = 0.0
@@ -354,7 +354,7 @@ def _solve(q, late, inverse, known, delayed, frequency):
 
 
 @compiled
-def _advance(q, before, step, first):
+def _advance_motion_signals(q, before, step, first):
     """Advance the signals q (10,) by one step.
 
     Speeds and impulse use the second-order Adams-Bashforth formula, their integrals the trapezoidal
@@ -446,7 +446,7 @@ def run_sine_sweep(case: TeleoperatorAxis, structure: str, frequencies: np.ndarr
     expected = transmitted_impedance(port, 1j * frequencies, case.task)
     measured = []
     if count_unstable_poles_held(port, case.task) == 0:
-        measured = [simulate_sine(case, structure, float(w)) for w in frequencies]
+        measured = [measure_sine_impedance(case, structure, float(w)) for w in frequencies]
     return SineSweep(structure, case.delay_forward, case.delay_back, frequencies, expected, np.array(measured))
 
 
@@ -465,7 +465,7 @@ def compare_stability(
         Predicted and simulated stability.
     """
     seen = [
-        [not is_growing(simulate_impulse(case.with_delay(float(t)), structure, float(k))) for t in delays]
+        [not is_growing(simulate_impulse_response(case.with_delay(float(t)), structure, float(k))) for t in delays]
         for k in factors
     ]
     predicted = stability_map(case, structure, delays, factors)
@@ -567,10 +567,10 @@ def describe_stability(analysis: StructureAnalysis, released: bool = False) -> s
     return f"no, {many} pole{'s' * (many != 1)}{free}"
 
 
-def format_factor(margin: float) -> str:
+def format_gain_margin(margin: float) -> str:
     """Format a gain margin as a factor; an infinite one as more than the largest tested factor.
 
-    >>> format_factor(0.17), format_factor(math.inf)
+    >>> format_gain_margin(0.17), format_gain_margin(math.inf)
     ('x 0.17', '> x 1000')
     """
     return f"> x {MAX_TESTED_FACTOR:g}" if math.isinf(margin) else f"x {margin:.3g}"
@@ -594,10 +594,10 @@ def format_number(value: float) -> str:
     return np.format_float_positional(value, precision=5, fractional=False, trim="-")
 
 
-def format_error(error: float | None) -> str:
+def format_relative_error(error: float | None) -> str:
     """Format a relative error in per cent; `not measurable` for None.
 
-    >>> format_error(0.0016), format_error(1e-7)
+    >>> format_relative_error(0.0016), format_relative_error(1e-7)
     ('0.16 %', '< 0.01 %')
     """
     if error is None:
@@ -684,7 +684,8 @@ def _robustness_to_dict(one: Robustness) -> dict:
     }  # fmt: skip
     if one.z_width_result:
         document["z_width"] = {
-            "decades": one.z_width_result.decades, "max_stiffness_held": one.z_width_result.max_stiffness_held,
+            "decades": one.z_width_result.mean_width_decades,
+            "max_stiffness_held": one.z_width_result.max_stiffness_held,
             "max_stiffness_released": one.z_width_result.max_stiffness_released,
             "max_tested_stiffness": one.z_width_result.max_tested_stiffness,
         }  # fmt: skip
@@ -703,8 +704,8 @@ def _complex_to_pairs(values: np.ndarray) -> list:
 def _spring_to_dict(one: StiffnessAxis) -> dict:
     return {
         "mass": one.mass, "damping": one.damping, "min_stiffness": one.min_stiffness,
-        "max_stiffness": one.max_stiffness, "margin": one.theorem_margin,
-        "theorem_damping": one.theorem_damping, "worst_growth": one.half_swing_growth,
+        "max_stiffness": one.max_stiffness, "margin": one.stability_theorem_margin,
+        "theorem_damping": one.stability_theorem_damping, "worst_growth": one.half_swing_growth,
         "min_stable_damping": one.min_stable_damping, "stable_by": one.stability_criterion,
     }  # fmt: skip
 
@@ -880,7 +881,7 @@ def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structur
         many = count_unstable_poles(case.make_port(structure), case.hand, case.task)
     except PoleOnAxisError:
         many = None
-    margin = gain_margin(case, structure)
+    margin = find_gain_margin(case, structure)
     frequency, pole = _find_oscillation(case, structure, margin)
     ratio = passing = math.nan
     if structure.endswith("force"):
@@ -902,16 +903,16 @@ def _find_oscillation(case: LinearCase, structure: str, margin: float) -> tuple[
     if not 0.0 < margin < math.inf:
         return math.nan, complex(math.nan, math.nan)
 
-    def characteristic(s: complex | np.ndarray, factor: float) -> np.ndarray:
+    def evaluate_characteristic_function(s: complex | np.ndarray, factor: float) -> np.ndarray:
         return 1.0 + loop_gain(case.make_port(structure, factor), s, case.hand, case.task)
 
-    place = int(np.argmin(np.abs(characteristic(1j * _SEARCH_FREQUENCIES, margin))))
+    place = int(np.argmin(np.abs(evaluate_characteristic_function(1j * _SEARCH_FREQUENCIES, margin))))
     s = 1j * float(_SEARCH_FREQUENCIES[place])
     for factor in np.geomspace(margin, 1.0, _CONTINUATION_STEPS):
         for _ in range(_NEWTON_STEPS):
             step = 1e-6 * abs(s)
-            here = complex(characteristic(s, factor))
-            slope = (complex(characteristic(s + step, factor)) - here) / step
+            here = complex(evaluate_characteristic_function(s, factor))
+            slope = (complex(evaluate_characteristic_function(s + step, factor)) - here) / step
             s -= here / slope
     return float(_SEARCH_FREQUENCIES[place]) / (2.0 * math.pi), s
 
@@ -954,7 +955,7 @@ def scenario_findings_to_dict(found: ScenarioFindings) -> dict:
             **{
                 name: {
                     "mass": one.mass, "damping": one.damping, "max_stiffness": one.max_stiffness,
-                    "margin": one.theorem_margin, "theorem_damping": one.theorem_damping,
+                    "margin": one.stability_theorem_margin, "theorem_damping": one.stability_theorem_damping,
                     "worst_growth": one.half_swing_growth, "min_stable_damping": one.min_stable_damping,
                     "stable_by": one.stability_criterion,
                 }

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.estimation import estimate
+from hydrotele.identify.estimation import estimate_linear_parameters
 from hydrotele.teleop.coils import Coils
-from hydrotele.teleop.compliance import GRAVITY, Flotor, quaternion_to_matrix, rotation_between
+from hydrotele.teleop.compliance import GRAVITY, Flotor, quaternion_to_matrix, relative_quaternion
 
 FLOTOR_PARAMETERS = (
     "mass",
@@ -64,7 +64,7 @@ class FlotorFit:
         return Flotor(float(self.value[0]), self.value[1:4].copy(), _inertia_matrix(self.value[4:]))
 
 
-def identify_flotor(
+def identify_flotor_parameters(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils,
     cutoff: float = _CUTOFF,
 ) -> FlotorFit:  # fmt: skip
@@ -97,25 +97,25 @@ def identify_flotor(
         raise InputError(_WHERE, f"needs at least {4 * _SETTLING_TIME:g} s, got {len(place) * period:g} s")
     if not all(np.isfinite(part).all() for part in (place, quaternion, currents)):
         raise InputError(_WHERE, "poses and currents must be finite: remove faulty samples")
-    matrix, wrench = flotor_equations(place, quaternion, currents, period, coils)
+    matrix, wrench = build_flotor_regression(place, quaternion, currents, period, coils)
     low = butter(4, cutoff, fs=1.0 / period, output="sos")
     every = max(1, int(0.25 / (cutoff * period)))  # faster sampling adds no information
     kept = slice(ends, -ends, every)
     matrix, wrench = (sosfiltfilt(low, part, axis=0)[kept] for part in (matrix, wrench))
     moving = np.sqrt(np.sum(matrix**2, axis=(0, 1))).all()
-    found = estimate(matrix, wrench) if moving else None
+    found = estimate_linear_parameters(matrix, wrench) if moving else None
     if found is None or (np.std(found.residual, axis=0) > _MAX_RESIDUAL_RATIO * np.std(wrench, axis=0)).any():
         raise InputError(_WHERE, "not all ten parameters are identifiable: rotate about every axis")
     value, slope = _move_to_centre_of_mass(found.value)
     noise = np.diag(slope @ found.covariance @ slope.T)
-    interval = np.hypot(_CONFIDENCE_SIGMAS * np.sqrt(noise), _difference_errors(value))
+    interval = np.hypot(_CONFIDENCE_SIGMAS * np.sqrt(noise), _differentiation_errors(value))
     return FlotorFit(
         value, interval, np.sqrt(np.mean(found.residual**2, axis=0)),
         found.condition, len(wrench),
     )  # fmt: skip
 
 
-def flotor_equations(
+def build_flotor_regression(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils
 ) -> tuple[np.ndarray, np.ndarray]:
     """Build the linear equations of motion of the flotor, `regressor @ parameters = wrench`.
@@ -154,7 +154,7 @@ def flotor_equations(
     return matrix, 0.5 * (held[:-2] + held[1:-1])
 
 
-def _difference_errors(value: np.ndarray) -> np.ndarray:
+def _differentiation_errors(value: np.ndarray) -> np.ndarray:
     """Return the errors (10,) of the parameters due to derivatives by difference quotients.
 
     They hold for motions up to 6 Hz that are sampled at 200 Hz.
@@ -166,7 +166,7 @@ def _difference_errors(value: np.ndarray) -> np.ndarray:
 
 def _relative_rotation(first: np.ndarray, then: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) between two orientations, in the body's axes [rad]."""
-    scalar, vector = rotation_between(first, then)
+    scalar, vector = relative_quaternion(first, then)
     size = float(np.linalg.norm(vector))
     return vector * (2.0 * np.arctan2(size, scalar) / size if size > 1e-12 else 2.0)
 
@@ -202,7 +202,7 @@ def _move_to_centre_of_mass(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     with respect to the given ones, by central differences.
     """
 
-    def convert(p: np.ndarray) -> np.ndarray:
+    def convert_parameters(p: np.ndarray) -> np.ndarray:
         centre = p[1:4] / p[0]
         parallel = p[0] * (centre @ centre * np.eye(3) - np.outer(centre, centre))
         inertia = _inertia_matrix(p[4:]) - parallel
@@ -210,5 +210,5 @@ def _move_to_centre_of_mass(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         return np.concatenate([p[:1], centre, upper])
 
     steps = 1e-6 * np.diag(np.maximum(np.abs(linear), 1e-6))
-    slope = [(convert(linear + d) - convert(linear - d)) / (2.0 * d.sum()) for d in steps]
-    return convert(linear), np.column_stack(slope)
+    slope = [(convert_parameters(linear + d) - convert_parameters(linear - d)) / (2.0 * d.sum()) for d in steps]
+    return convert_parameters(linear), np.column_stack(slope)

@@ -30,7 +30,7 @@ from hydrotele.teleop.compliance import (
     FlotorMotion,
     compliance_wrench,
     quaternion_to_matrix,
-    rotation_between,
+    relative_quaternion,
 )
 
 MAX_FROZEN_TIME = 0.1  # s: a reading with noise is never constant for twenty periods
@@ -153,7 +153,7 @@ def step_levitation(
     velocity, rate = np.zeros(3), np.zeros(3)
     if np.isfinite(before.place).all():
         velocity = (place - before.place) / control.period
-        rate = 2.0 * rotation_between(before.quaternion, quaternion)[1] / control.period
+        rate = 2.0 * relative_quaternion(before.quaternion, quaternion)[1] / control.period
     motion = FlotorMotion(place, quaternion, velocity, rate)
     wrench = compliance_wrench(control.flotor_model, control.axes, control.handle, motion, target, target_rotation)
     found = control.coils.compute_currents(wrench)
@@ -230,20 +230,20 @@ def solve_flotor_pose(readings: np.ndarray, distance: float) -> tuple[np.ndarray
     for _ in range(_MAX_NEWTON_STEPS):
         now, slope = _trace_beams(place, turn, distance)
         step = np.linalg.solve(slope, readings - now)
-        place, turn = place + step[:3], _rotation_matrix(step[3:]) @ turn
+        place, turn = place + step[:3], _rotation_vector_to_matrix(step[3:]) @ turn
         if np.abs(step).max() < _NEWTON_TOLERANCE:
             return place, turn
     raise InputError(_WHERE, f"no pose corresponds to the readings {readings}")
 
 
-def pose_resolution(distance: float, step: float) -> np.ndarray:
+def pose_resolution(distance: float, reading_resolution: float) -> np.ndarray:
     """Return the standard deviations of a pose measured with diodes of finite resolution.
 
     They hold for a flotor at its centre.
 
     Args:
         distance: distance of the diodes from the centre [m].
-        step: resolution of their readings [m].
+        reading_resolution: resolution of their readings [m].
 
     Returns:
         (6,) standard deviations of position [m] and rotation [rad], for errors that are uniform
@@ -253,7 +253,7 @@ def pose_resolution(distance: float, step: float) -> np.ndarray:
     """
     _, slope = _trace_beams(np.zeros(3), np.eye(3), distance)
     inverse = np.linalg.inv(slope)
-    return step / np.sqrt(12.0) * np.sqrt(np.sum(inverse**2, axis=1))
+    return reading_resolution / np.sqrt(12.0) * np.sqrt(np.sum(inverse**2, axis=1))
 
 
 def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
@@ -278,7 +278,7 @@ def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
     return readings, slope
 
 
-def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
+def _rotation_vector_to_matrix(vector: np.ndarray) -> np.ndarray:
     """Convert a rotation vector (3,) [rad] to a rotation matrix (3, 3) by Rodrigues' formula."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / angle if angle > 0.0 else vector
@@ -361,8 +361,8 @@ class PoseSensor:
             quaternion = np.empty(4)
             mujoco.mju_mat2Quat(quaternion, turned.ravel())
             return found - self._handle, quaternion
-        pose = self._add_noise_and_round(np.concatenate([qpos[:3], quaternion_to_vector(qpos[3:7])]))
-        quaternion = vector_to_quaternion(pose[3:])
+        pose = self._add_noise_and_round(np.concatenate([qpos[:3], quaternion_to_rotation_vector(qpos[3:7])]))
+        quaternion = rotation_vector_to_quaternion(pose[3:])
         return coil_frame_position(self._handle, pose[:3], quaternion), quaternion
 
     def _add_noise_and_round(self, values: np.ndarray) -> np.ndarray:
@@ -409,12 +409,12 @@ def simulate_levitation(
     currents, limited, blind = np.empty((n, 6)), np.empty(n, bool), np.empty(n, bool)
     for k, goal in enumerate(target):
         qpos = flotor.data.qpos
-        pose[k, :3], pose[k, 3:] = qpos[:3], quaternion_to_vector(qpos[3:7])
+        pose[k, :3], pose[k, 3:] = qpos[:3], quaternion_to_rotation_vector(qpos[3:7])
         seen = eye.read(qpos)
         place[k], quaternion[k] = sensor_fault(k, seen) if sensor_fault else seen
         memory, (currents[k], limited[k], blind[k]) = step_levitation(
             control, memory, place[k].copy(), quaternion[k].copy(), goal[:3],
-            vector_to_quaternion(goal[3:]),
+            rotation_vector_to_quaternion(goal[3:]),
         )  # fmt: skip
         if cab_motion:
             flotor.step_in_cab(
@@ -480,14 +480,14 @@ def second_order_step_response(time: np.ndarray, frequency: float, ratio: float)
     return 1.0 - np.exp(-ratio * frequency * time) * wave
 
 
-def quaternion_to_vector(quaternion: np.ndarray) -> np.ndarray:
+def quaternion_to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
     """Convert a quaternion (4,), scalar first, to a rotation vector (3,) [rad]."""
     out = np.zeros(3)
     mujoco.mju_quat2Vel(out, quaternion, 1.0)
     return out
 
 
-def vector_to_quaternion(vector: np.ndarray) -> np.ndarray:
+def rotation_vector_to_quaternion(vector: np.ndarray) -> np.ndarray:
     """Convert a rotation vector (3,) [rad] to a quaternion (4,), scalar first."""
     angle = float(np.linalg.norm(vector))
     out = np.zeros(4)

@@ -49,7 +49,7 @@ from hydrotele.estimate.reduced_model import X, place_mechanism
 from hydrotele.hydraulics.circuit import SLOT_COUNT, ActuatorKind, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
-from hydrotele.machine.machine import Machine, get_sensors
+from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.multibody.reduced_mechanism import compute_mass_and_bias
 from hydrotele.scenario.scenario import Plate, Scenario, Servo
 from hydrotele.scenario.teleoperation import RegulateForce, TeleopPilot, TrackForce
@@ -139,9 +139,9 @@ def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, s
     arm = create_arm_balance(machine, where)
     for i, name in zip(arm.joint, axes, strict=True):
         arm.z[i] = joints.get(name, arm.z[i])
-    mass, lever, blend = _effective_mass(arm, COORDINATES.index(coordinate))
+    mass, lever, blend = _tip_mass_and_lever_arms(arm, COORDINATES.index(coordinate))
     valves = [list(machine.hydraulic_axes).index(name) for name in axes]
-    turning = np.array([_joint_stiffness(arm, valve) for valve in valves])
+    turning = np.array([_joint_oil_stiffness(arm, valve) for valve in valves])
     if not np.any(lever):
         raise InputError(where, f"no joint moves {coordinate} in this pose")
     user = arm.model.user.reshape(-1, SLOT_COUNT)[valves]
@@ -153,7 +153,7 @@ def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, s
     )  # fmt: skip
 
 
-def _effective_mass(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
+def _tip_mass_and_lever_arms(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Compute the effective mass of the tip along a task coordinate, and the joints' lever arms.
 
     Args:
@@ -176,7 +176,7 @@ def _effective_mass(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.nd
     return mass, lever, np.linalg.solve(table, np.eye(k)[row])
 
 
-def _joint_stiffness(arm: ArmBalance, valve: int) -> float:
+def _joint_oil_stiffness(arm: ArmBalance, valve: int) -> float:
     """Return the stiffness of a joint due to the oil in its drive's chambers [N m/rad].
 
     The pose is that of the last `place_mechanism`. Air content is neglected: it lowers the stiffness
@@ -210,7 +210,7 @@ def tip_controller_impedance(tip: TipModel, servo: Servo, clocks: SamplingPeriod
 
     Source: this module's docstring.
     """
-    valve, place_lag, rubbing = _drive_lags(tip, servo, clocks, s)
+    valve, place_lag, rubbing = _drive_frequency_responses(tip, servo, clocks, s)
     single = (1.0 + tip.gain * valve * place_lag / s[..., None]) / (s[..., None] + rubbing)
     return 1.0 / (tip.compliance / single).sum(axis=-1)
 
@@ -229,14 +229,14 @@ def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, 
 
     Source: this module's docstring; `teleop.slave.update_references` for the phase lead.
     """
-    valve, place_lag, _ = _drive_lags(tip, servo, clocks, s)
+    valve, place_lag, _ = _drive_frequency_responses(tip, servo, clocks, s)
     held = np.exp(-0.5 * clocks.control_period * s)
     ahead = servo.feedforward * held * (1.0 + servo.lead * s / (LEAD_AVERAGING_TIME * s + 1.0))
     back = tip.gain * place_lag / s[..., None]
     return (tip.rate_fractions * valve * (ahead[..., None] + back) / (1.0 + valve * back)).sum(axis=-1)
 
 
-def _drive_lags(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
+def _drive_frequency_responses(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
     """Return three frequency responses (..., k) of the k drives at complex frequencies s (...).
 
     They are valve velocity per command, with the command's delay [1]; the delay of half a sensor
@@ -342,12 +342,12 @@ class LinearCase:
         own = self.hand_impedance.stiffness / s * np.exp(-late * s)
         return self.hand_impedance(s) - own
 
-    def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+    def make_port(self, structure: str, return_gain: float = 1.0) -> TwoPort:
         """Return the linear two-port of joystick and machine with a given control structure.
 
         Args:
             structure: `rate_force`, `position_force`, `rate_position` or `position_position`.
-            reflected: factor on the return channels, and on the coupling at the master [1].
+            return_gain: factor on the return channels, and on the coupling at the master [1].
 
         Returns:
             The two-port.
@@ -363,18 +363,18 @@ class LinearCase:
         def zero_block(s: np.ndarray) -> np.ndarray:
             return np.zeros_like(s)
 
-        def control(s: np.ndarray) -> np.ndarray:
+        def slave_control_block(s: np.ndarray) -> np.ndarray:
             return tip_controller_impedance(self.tip, self.servo, self.periods, s)
 
-        def forward(s: np.ndarray) -> np.ndarray:
+        def velocity_forward_block(s: np.ndarray) -> np.ndarray:
             follows = tip_tracking_response(self.tip, self.servo, self.periods, s)
-            return (self.tip.mass * s + control(s)) * follows * self._commanded_velocity(rate, s)
+            return (self.tip.mass * s + slave_control_block(s)) * follows * self._commanded_velocity(rate, s)
 
-        def back(s: np.ndarray) -> np.ndarray:
-            return reflected * self.ratio * self._reflected_force_response(s)
+        def force_back_block(s: np.ndarray) -> np.ndarray:
+            return return_gain * self.ratio * self._reflected_force_response(s)
 
         def coupling_block(s: np.ndarray) -> np.ndarray:
-            return -reflected * self._coupling_impedance(rate, s)
+            return -return_gain * self._coupling_impedance(rate, s)
 
         def master_block(s: np.ndarray) -> np.ndarray:
             if feels_force:
@@ -386,10 +386,11 @@ class LinearCase:
                 late = self.delay_forward + self.delay_back
                 asked = np.exp(-s * late) * self._commanded_velocity(rate, s)
                 linked = self._coupling_impedance(rate, s) * asked
-            return self._centring_impedance(rate, s) + reflected * linked
+            return self._centring_impedance(rate, s) + return_gain * linked
 
         return TwoPort(
-            self.master, slave, master_block, control, forward, back if feels_force else zero_block, zero_block,
+            self.master, slave, master_block, slave_control_block, velocity_forward_block,
+            force_back_block if feels_force else zero_block, zero_block,
             zero_block if feels_force else coupling_block, self.delay_forward, self.delay_back,
         )  # fmt: skip
 
@@ -534,8 +535,8 @@ def build_scenario_case(
     if wanted not in coordinates:
         message = f"no {wanted!r}; the arm has {', '.join(coordinates)}"
         raise InputError("--coordinate", message)
-    contact = _find_contact(scenario, machine, wanted)
-    sensors, period = get_sensors(machine, scenario.sensors), 1.0 / scenario.control_rate
+    contact = _determine_contact_pose(scenario, machine, wanted)
+    sensors, period = get_sensor_set(machine, scenario.sensors), 1.0 / scenario.control_rate
     clocks = SamplingPeriods(period, max(period, 1.0 / sensors.rate) if sensors else period)
     joystick = attach_operator_hand(joystick, pilot.perception, scenario.folder)
     numbers, _ = build_master(joystick, pilot, coordinates)
@@ -544,7 +545,7 @@ def build_scenario_case(
     return case, contact
 
 
-def scenario_joystick(scenario: Scenario) -> str:
+def find_scenario_joystick(scenario: Scenario) -> str:
     """Return the path of a scenario's own joystick file, or the name of a shipped joystick.
 
     An own file is relative to the folder of the scenario.
@@ -559,7 +560,7 @@ def _default_coordinate(pilot: TeleopPilot) -> str:
     return operator.target.coordinate if isinstance(operator, RegulateForce | TrackForce) else "z"
 
 
-def _find_contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
+def _determine_contact_pose(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
     """Return the contact with the scenario's plate, or else with stiff ground at the start pose.
 
     For a plate, the start pose is moved along the coordinate to the plate's position.

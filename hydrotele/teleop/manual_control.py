@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.compiled import compiled, inlined
+from hydrotele.core.compiled import compile_inlined, compiled
 from hydrotele.teleop.operator_parameters import Operator
 
 GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
@@ -114,8 +114,8 @@ def make_visual_loop(
     )  # fmt: skip
 
 
-@inlined
-def _past_value(past, tick, back, column):
+@compile_inlined
+def _interpolate_past_value(past, tick, back, column):
     """Return the value of a column of the ring buffer `past`, `back` decisions before `tick`.
 
     A fractional `back` interpolates between decisions. The value is 0 before the first decision.
@@ -129,7 +129,7 @@ def _past_value(past, tick, back, column):
 
 
 @compiled
-def update_element_fits(loop, tick, late, seen):
+def update_controlled_element_fits(loop, tick, late, seen):
     """Update the least-squares gain of every candidate model of the controlled element.
 
     Hand and output pass through a third-order high-pass (wash-out) of bandwidth a, so that slow drift
@@ -159,7 +159,7 @@ def update_element_fits(loop, tick, late, seen):
     best, least = 0, np.inf
     for i in range(len(loop.lag)):
         row, lag = loop.hand[i], loop.lag[i]
-        hand = _past_value(loop.history, tick, late + loop.dead_time[i] / step, 2)
+        hand = _interpolate_past_value(loop.history, tick, late + loop.dead_time[i] / step, 2)
         row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
         row[1] += share * (row[0] - row[1])
         row[2] += share * (row[1] - row[2])
@@ -183,7 +183,7 @@ def update_element_fits(loop, tick, late, seen):
 
 
 @compiled
-def estimate_element_gain(loop):
+def estimate_controlled_element_gain(loop):
     """Estimate the gain of the controlled element: fitted gain, weighted with the expected gain.
 
     Both are weighted by their uncertainty, so that the estimate starts at the expected gain.
@@ -236,11 +236,13 @@ def decide_hand_reference(loop, tick, target, seen, hand):
     if tick < int(late) + 3:
         return 0.0
     middle = 0.5 if facts[FORM] == 0.0 else 0.0  # the integrator uses the middle of its step
-    error = _past_value(past, tick, late + middle, 0)
-    rate = (_past_value(past, tick, late - 0.5, 0) - _past_value(past, tick, late + 0.5, 0)) / step
-    update_element_fits(loop, tick, late, _past_value(past, tick, late, 1))
+    error = _interpolate_past_value(past, tick, late + middle, 0)
+    rate = (
+        _interpolate_past_value(past, tick, late - 0.5, 0) - _interpolate_past_value(past, tick, late + 0.5, 0)
+    ) / step
+    update_controlled_element_fits(loop, tick, late, _interpolate_past_value(past, tick, late, 1))
     best = int(state[SELECTED_CANDIDATE])
-    gain = estimate_element_gain(loop)
+    gain = estimate_controlled_element_gain(loop)
     share = 1.0 - np.exp(-step / _VARIANCE_TIME)
     state[ERROR_POWER] += share * (error * error - state[ERROR_POWER])
     state[RATE_POWER] += share * (rate * rate - state[RATE_POWER])
@@ -300,7 +302,7 @@ def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, m
     return float(min(1.0 / np.interp(at, w, size), operator.gain_margin / beyond))
 
 
-def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.ndarray:
+def discretise_neuromuscular_lag(frequency: float, damping: float, step: float) -> np.ndarray:
     """Discretise the neuromuscular lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)` exactly.
 
     Args:
@@ -424,7 +426,7 @@ def simulate_tracking(
     )
     if not has_gain_error:
         loop.parameters[EXPECTED_GAIN] = loop.state[ESTIMATED_GAIN] = gain
-    lag = neuromuscular_matrix(operator.neuromuscular_frequency, operator.neuromuscular_damping, step)
+    lag = discretise_neuromuscular_lag(operator.neuromuscular_frequency, operator.neuromuscular_damping, step)
     hand, response = np.zeros((2, len(target)))
     _simulate_tracking(loop, lag, form, gain, np.asarray(target, float), steps_per_decision, hand, response)
     return TrackingRecord(step * np.arange(len(target)), np.asarray(target), response, hand)

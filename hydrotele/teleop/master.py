@@ -35,8 +35,8 @@ from hydrotele.teleop.axis_table import (
     SIGN,
     STIFFNESS_PER_FORCE,
     build_axis_table,
-    flatten_state,
-    make_flat_state,
+    copy_to_contiguous_state,
+    make_contiguous_state,
     split_array,
 )
 from hydrotele.teleop.coils import make_three_station_coils
@@ -195,13 +195,13 @@ def build_master(
             pilot.coordinating_position == "handle", pilot.compliance == "decoupled",
         ]),
     )  # fmt: skip
-    state = make_flat_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT_SIGNAL + 2)])
+    state = make_contiguous_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT_SIGNAL + 2)])
     state.limited[:] = 1.0
-    return flatten_state(numbers), state
+    return copy_to_contiguous_state(numbers), state
 
 
 @compiled
-def unpack_master(flat):
+def unpack_master_parameters(flat):
     """Return the fields of MasterParameters as views of a flat array.
 
     Args:
@@ -258,7 +258,7 @@ def unpack_master_state(flat):
 
 
 @compiled
-def measure_handle(numbers, qpos, period, s):
+def measure_handle(parameters, qpos, period, s):
     """Measure the handle's displacement, its rate, and the energy that the hand has supplied.
 
     The displacement is rounded to the sensing resolution, and the rate is its difference. The energy
@@ -266,7 +266,7 @@ def measure_handle(numbers, qpos, period, s):
     force.
 
     Args:
-        numbers: MasterParameters.
+        parameters: MasterParameters.
         qpos: (7,) flotor position [m] and quaternion, scalar first.
         period: time since the last reading, scalar [s]; 0 for the first one.
         s: MasterState; `handle`, `speed` and `energy` are written.
@@ -283,19 +283,19 @@ def measure_handle(numbers, qpos, period, s):
         factor = factor * np.arctan2(size, abs(w)) / size
     for i in range(6):
         value = qpos[i] if i < 3 else factor * qpos[i + 1]
-        if numbers.resolution[i] > 0.0:
-            value = np.rint(value / numbers.resolution[i]) * numbers.resolution[i]
+        if parameters.resolution[i] > 0.0:
+            value = np.rint(value / parameters.resolution[i]) * parameters.resolution[i]
         speed = (value - s.handle[i]) / period if period > 0.0 else 0.0
         if period > 0.0:
-            own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+            own = parameters.mass[0] if i < 3 else parameters.inertia[i - 3]
             gained = 0.5 * own * (speed**2 - s.speed[i] ** 2)
-            s.energy[0] += gained - _applied_force(numbers, s, i) * (value - s.handle[i])
+            s.energy[0] += gained - _force_without_hand(parameters, s, i) * (value - s.handle[i])
         s.speed[i], s.handle[i] = speed, value
     s.energy[1] = min(s.energy[1], s.energy[0])
 
 
 @compiled
-def _applied_force(numbers, s, i):
+def _force_without_hand(numbers, s, i):
     """Return the force on handle axis i since the last reading, without that of the hand [N], [N m].
 
     It is the force of the coils plus the part of the weight that limited currents do not carry.
@@ -307,17 +307,17 @@ def _applied_force(numbers, s, i):
 
 
 @compiled
-def compute_reflection(numbers, packet, fresh, period, s):
+def compute_reflected_forces(parameters, packet, packet_gain, period, s):
     """Compute the coils' force on every axis of the handle, which reflects the machine's force.
 
     It consists of spring, damper and detent of the joystick, and of the selected structure of force
     reflection.
 
     Args:
-        numbers: MasterParameters.
+        parameters: MasterParameters.
         packet: (8, k) data from the machine in task units: tip force, position and speed of the tip
             and of its reference, stiffness, damping and mass of the task.
-        fresh: factor on the packet, scalar: 1, falling to 0 while the channel is silent.
+        packet_gain: factor on the packet, scalar: 1, falling to 0 while the channel is silent.
         period: control period, scalar [s].
         s: MasterState; `push`, `stiffness`, `integral`, `before` and `line` are written.
 
@@ -326,14 +326,14 @@ def compute_reflection(numbers, packet, fresh, period, s):
 
     Source: Zhu 1994, 3.52-3.53, 3.59-3.62, 3.75, 4.1, Fig. 6.51; `teleop.passive_line`.
     """
-    kind, mode = numbers.kind[0], numbers.kind[1]
+    kind, mode = parameters.kind[0], parameters.kind[1]
     for i in range(6):
-        row, x, v = numbers.axis[i], s.handle[i], s.speed[i]
+        row, x, v = parameters.axis[i], s.handle[i], s.speed[i]
         c, sign, gain = int(row[COORDINATE]), row[SIGN], row[GAIN]
         stiff, rub, push = row[NOMINAL_STIFFNESS], row[DAMPING], 0.0
         way = 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
         if c >= 0 and kind != NONE:
-            force = fresh * sign * packet[TIP_FORCE, c]
+            force = packet_gain * sign * packet[TIP_FORCE, c]
             if not np.isfinite(force):
                 force = 0.0
             kept = min(row[MAX_REFLECTED_FORCE], max(-row[MAX_REFLECTED_FORCE], force))
@@ -347,30 +347,30 @@ def compute_reflection(numbers, packet, fresh, period, s):
                 )
             elif kind == DIRECT_FORCE:
                 push += row[REFLECTION_RATIO] * kept
-            elif kind == COORDINATING and numbers.kind[2] > 0.0:
-                push -= fresh * _coordinating_force(row, mode, packet, period, s, i)
+            elif kind == COORDINATING and parameters.kind[2] > 0.0:
+                push -= packet_gain * _coordinating_force(row, mode, packet, period, s, i)
             elif kind == COORDINATING:
                 share = sign / gain if mode == POSITION else sign
                 behind = share * (packet[REFERENCE_POSITION, c] - packet[TIP_POSITION, c])
                 slower = share * (packet[REFERENCE_SPEED, c] - packet[TIP_SPEED, c])
-                push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
+                push -= packet_gain * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
             elif kind == FOUR_CHANNEL:
-                push += _four_channel_force(row, mode, kept, packet, fresh, period, s, i)
+                push += _four_channel_force(row, mode, kept, packet, packet_gain, period, s, i)
             elif kind == IMPEDANCE:
-                felt = fresh * row[REFLECTION_RATIO] * gain
+                felt = packet_gain * row[REFLECTION_RATIO] * gain
                 stiff = min(
                     row[MAX_STIFFNESS],
                     max(row[MIN_STIFFNESS], stiff + felt * packet[TASK_STIFFNESS, c]),
                 )
                 rub += min(rub, felt * packet[TASK_DAMPING, c])  # limited: sampling
-                own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+                own = parameters.mass[0] if i < 3 else parameters.inertia[i - 3]
                 change = _DERIVATIVE_BANDWIDTH * (v - s.before[i])
                 s.before[i] += period * change
                 heavier = felt * packet[TASK_MASS, c]
                 if heavier > 0.0:  # false for NaN
                     push -= min(_MAX_ADDED_MASS_RATIO * own, heavier) * change
             elif kind == WAVE_VARIABLES or kind == PASSIVITY_CONTROL:
-                push -= fresh * _passive_channel_force(numbers, row, packet, period, s, i)
+                push -= packet_gain * _passive_channel_force(parameters, row, packet, period, s, i)
         s.stiffness[i] = stiff
         beyond = abs(x) - row[DEADBAND]
         if row[DETENT_STIFFNESS] >= 0.0 and beyond > 0.0:
@@ -378,7 +378,7 @@ def compute_reflection(numbers, packet, fresh, period, s):
             push -= way * (max(stiff * row[DEADBAND] - row[DETENT_DROP], 0.0) + stiff_out * beyond)
         else:
             push -= stiff * x
-        total = push - rub * v + fresh * s.extra[i]
+        total = push - rub * v + packet_gain * s.extra[i]
         s.push[i] = (
             total if np.isfinite(total) else -row[NOMINAL_STIFFNESS] * x - row[DAMPING] * v
         )  # fallback: spring and damper only
@@ -459,14 +459,14 @@ def _decoupled_wrench(numbers, turn, s, wrench):
 
 
 @compiled
-def drive_coils(numbers, quaternion, period, s):
+def drive_coils(parameters, quaternion, period, s):
     """Compute the coil currents of this period, and estimate the hand force.
 
     The currents produce the force `push` on the handle and carry the flotor's weight. If a current
     exceeds its limit, the whole wrench is scaled down and keeps its direction.
 
     Args:
-        numbers: MasterParameters.
+        parameters: MasterParameters.
         quaternion: (4,) orientation of the flotor, scalar first.
         period: control period, scalar [s].
         s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
@@ -478,26 +478,26 @@ def drive_coils(numbers, quaternion, period, s):
     """
     turn, wrench = np.empty((3, 3)), np.empty(6)
     quaternion_to_matrix(quaternion, turn)
-    if numbers.kind[3] > 0.0:
-        _decoupled_wrench(numbers, turn, s, wrench)
+    if parameters.kind[3] > 0.0:
+        _decoupled_wrench(parameters, turn, s, wrench)
     else:
         held_flotor_wrench(
-            numbers.mass[0], numbers.centre_of_mass, numbers.handle, s.push, turn, numbers.gravity, wrench
+            parameters.mass[0], parameters.centre_of_mass, parameters.handle, s.push, turn, parameters.gravity, wrench
         )
-    largest = numbers.max_current[0]
+    largest = parameters.max_current[0]
     for i in range(6):
         s.currents[i] = 0.0
         for j in range(6):
-            s.currents[i] += numbers.to_currents[i, j] * wrench[j]
+            s.currents[i] += parameters.to_currents[i, j] * wrench[j]
         if not np.isfinite(s.currents[i]):
             s.currents[i] = 0.0
         largest = max(largest, abs(s.currents[i]))
-    s.limited[0] = numbers.max_current[0] / largest
+    s.limited[0] = parameters.max_current[0] / largest
     for i in range(6):
         s.currents[i] *= s.limited[0]
-        own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+        own = parameters.mass[0] if i < 3 else parameters.inertia[i - 3]
         s.hand[i] = _OBSERVER_BANDWIDTH * (own * s.speed[i] - s.momentum[i])
-        s.momentum[i] += period * (_applied_force(numbers, s, i) + s.hand[i])
+        s.momentum[i] += period * (_force_without_hand(parameters, s, i) + s.hand[i])
 
 
 @compiled
@@ -513,16 +513,16 @@ def _reset_master(s):
 
 
 @compiled
-def step_master(numbers, qpos, packet, fresh, period, first, s):
+def step_master(parameters, qpos, packet, packet_gain, period, first, s):
     """Run one control period of the master: measure the handle, reflect forces, drive the coils.
 
     A reading that is not finite switches the coils off and leaves the machine without a command.
 
     Args:
-        numbers: MasterParameters.
+        parameters: MasterParameters.
         qpos: (7,) flotor position [m] and quaternion, scalar first.
-        packet: (8, k) data from the machine, rows as in `compute_reflection`.
-        fresh: factor on the packet, scalar, 0 to 1.
+        packet: (8, k) data from the machine, rows as in `compute_reflected_forces`.
+        packet_gain: factor on the packet, scalar, 0 to 1.
         period: control period, scalar [s].
         first: whether this is the first period, scalar.
         s: MasterState, written.
@@ -530,14 +530,14 @@ def step_master(numbers, qpos, packet, fresh, period, first, s):
     Returns:
         Nothing.
 
-    Source: `measure_handle`, `compute_reflection` and `drive_coils` in turn.
+    Source: `measure_handle`, `compute_reflected_forces` and `drive_coils` in turn.
     """
     if not np.isfinite(qpos).all():
         _reset_master(s)
         return
-    measure_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
-    compute_reflection(numbers, packet, fresh, period, s)
-    drive_coils(numbers, qpos[3:7], period, s)
+    measure_handle(parameters, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
+    compute_reflected_forces(parameters, packet, packet_gain, period, s)
+    drive_coils(parameters, qpos[3:7], period, s)
 
 
 _GRAVITY = 9.81
@@ -576,7 +576,7 @@ def tipping_ratio(tip_over: TipOver, radius: float, force: float) -> float:
     )
 
 
-def tip_over_wrench(
+def compute_tip_over_protection(
     tip_over: TipOver, numbers: MasterParameters, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
     speed: np.ndarray, extra: np.ndarray,
 ) -> None:  # fmt: skip
@@ -589,7 +589,7 @@ def tip_over_wrench(
     Args:
         tip_over: tip-over parameters of the machine.
         numbers: parameters of the master.
-        packet: (8, k) data from the machine, rows as in `compute_reflection`.
+        packet: (8, k) data from the machine, rows as in `compute_reflected_forces`.
         start: (5,) pose of the tip at the start: r [m], theta [rad], z [m], attitude, head [rad].
         handle: (6,) measured displacement of the handle [m], [rad].
         speed: (6,) its rate [m/s], [rad/s].

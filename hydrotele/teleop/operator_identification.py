@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.units import to_si
+from hydrotele.core.units import si_unit_and_factor
 from hydrotele.logs.table import read_table
 from hydrotele.teleop.manual_control import FORMS, TrackingRecord
 from hydrotele.teleop.operator_parameters import load_operator_file
@@ -111,7 +111,7 @@ class OperatorFit(NamedTuple):
     response: np.ndarray
 
 
-def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[TrackingRecord, list[str]]:
+def read_tracking_record(path: Path, names: Mapping[str, str] | None = None) -> tuple[TrackingRecord, list[str]]:
     """Read time, target, response and hand motion of a tracking task from a CSV or Parquet file.
 
     Columns are `time`, `target`, `response` and `hand`, or the names in `names`. Without a column
@@ -147,7 +147,7 @@ def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[T
         place = table.names.index(name)
         unit, values = table.units[place], np.array(table.values[place], float)
         if unit is not None:
-            values *= to_si(unit)[1]
+            values *= si_unit_and_factor(unit)[1]
         if np.isinf(values).any():
             row = int(np.flatnonzero(np.isinf(values))[0])
             raise InputError(table.location(str(name), row), "is infinite: remove the row")
@@ -193,9 +193,11 @@ def identify_operator(record: TrackingRecord, equalisation: str | None = None, s
         message = f"{equalisation!r}; valid: {', '.join(EQUALISATIONS)}"
         raise InputError("--equalisation", message)
     step, signals, notes = _resample_record(record, source)
-    filtered = {name: _filter(values, step, _highpass_response) for name, values in signals.items()}
+    filtered = {
+        name: _filter_with_transfer_function(values, step, _highpass_response) for name, values in signals.items()
+    }
     target, seen, hand = filtered["target"], filtered["error"], filtered["hand"]
-    from_target = _estimate_instrument(target, seen, step)
+    from_target = _estimate_instrumental_variable(target, seen, step)
     data = _TrackingData(step, target, seen, from_target, hand)
     kinds = (equalisation,) if equalisation else EQUALISATIONS
     fits = [fit for kind in kinds if (fit := _fit_equalisation(data, kind)) is not None]
@@ -268,14 +270,14 @@ def _highpass_response(s: np.ndarray) -> np.ndarray:
     return s / (s + _HIGHPASS_FREQUENCY)
 
 
-def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
+def _filter_with_transfer_function(values: np.ndarray, step: float, response) -> np.ndarray:
     """Filter a sampled signal with the transfer function `response(s)`, starting from rest."""
     pad = len(values) + round(4.0 * _SETTLING_TIME / step)
     s = 2j * np.pi * np.fft.rfftfreq(pad, step)
     return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
 
 
-def _estimate_instrument(
+def _estimate_instrumental_variable(
     target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
     """Estimate the part of the error `seen` that the target causes, as instrumental variable.
@@ -344,8 +346,8 @@ def _response_derivatives(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np
     return [whole * factor[name] for name in _parameter_names(kind)]
 
 
-def _predict_hand(data: _TrackingData, kind: str, logs: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return _filter(values, data.step, lambda s: _operator_response(kind, logs, s))
+def _predict_hand_motion(data: _TrackingData, kind: str, logs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return _filter_with_transfer_function(values, data.step, lambda s: _operator_response(kind, logs, s))
 
 
 def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
@@ -380,7 +382,7 @@ def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None
             usual = {"gain": 1.0, "delay": delay, "time_constant": constant,
                      "neuromuscular_frequency": 12.0, "neuromuscular_damping": 0.4}  # fmt: skip
             logs = np.log([usual[n] for n in names])
-            one = _predict_hand(data, kind, logs, data.target_error)[first:]
+            one = _predict_hand_motion(data, kind, logs, data.target_error)[first:]
             gain = float(one @ data.hand[first:] / max(one @ one, 1e-300))
             rest = float(np.sum((data.hand[first:] - gain * one) ** 2))
             starts.append((rest, gain, logs))
@@ -393,15 +395,15 @@ def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None
     logs = np.clip(logs, low + 1e-6, high - 1e-6)
 
     def residual(x: np.ndarray) -> np.ndarray:
-        return (hand - _predict_hand(data, kind, x, data.target_error))[first:]
+        return (hand - _predict_hand_motion(data, kind, x, data.target_error))[first:]
 
     logs = least_squares(residual, logs, bounds=(low, high), x_scale=0.3).x
     noise, white, settled = hand, np.ones(1), False
     for turn in range(30):
-        noise = (hand - _predict_hand(data, kind, logs, data.error))[first:]
+        noise = (hand - _predict_hand_motion(data, kind, logs, data.error))[first:]
         white = _fit_whitening_filter(noise, data.step)
-        z, d, rest = _instrument_equations(data, kind, logs, sign, white, data.target_error)
-        move = _solve_equations(z, d, rest)[: len(logs)]
+        z, d, rest = _build_instrumental_equations(data, kind, logs, sign, white, data.target_error)
+        move = _solve_instrumental_equations(z, d, rest)[: len(logs)]
         logs = np.clip(logs + np.clip(move, -0.3, 0.3) * (1.0 if turn < 20 else 0.5), low, high)
         settled = bool(np.abs(move).max() < 1e-3)
         if np.abs(move).max() < 1e-4:
@@ -414,7 +416,7 @@ def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None
     return _EqualisationFit(kind, names, sign, logs, np.zeros((0, 0)), noise, white, criterion, settled)
 
 
-def _instrument_equations(
+def _build_instrumental_equations(
     data: _TrackingData, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
     instrument: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
@@ -437,11 +439,11 @@ def _instrument_equations(
                            for k in range(len(logs))), begun])
         for values in (instrument, data.error)
     )  # fmt: skip
-    rest = apply_whitening(sign * data.hand - _predict_hand(data, kind, logs, data.error))
+    rest = apply_whitening(sign * data.hand - _predict_hand_motion(data, kind, logs, data.error))
     return z, d, rest
 
 
-def _solve_equations(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _solve_instrumental_equations(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Solve the instrumental-variable equations `z^T (rest - d x) = 0` for the parameter step x."""
     scale = np.linalg.norm(z, axis=0) + 1e-300
     matrix, right = (z / scale).T @ (d / scale), (z / scale).T @ rest
@@ -456,7 +458,7 @@ def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
     the remnant varies with the error and is also in the instrument.
     """
     arguments = data, fit.kind, fit.log_parameters, fit.sign, fit.whitening_filter
-    z, d, rest = _instrument_equations(*arguments, data.target_error)
+    z, d, rest = _build_instrumental_equations(*arguments, data.target_error)
     scale = np.linalg.norm(z, axis=0) + 1e-300
     inverse = np.linalg.pinv((z / scale).T @ (d / scale))
     equal = float(rest @ rest) / (len(rest) - z.shape[1])
@@ -465,9 +467,9 @@ def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
     for part in np.array_split(np.arange(len(rest)), _JACKKNIFE):
         kept = np.ones(len(data.hand), bool)
         kept[gone + part] = False
-        anew = _estimate_instrument(data.target, data.error, data.step, kept)
-        z = _instrument_equations(*arguments, anew)[0]
-        moves.append(_solve_equations(z[kept[gone:]], d[kept[gone:]], rest[kept[gone:]]))
+        anew = _estimate_instrumental_variable(data.target, data.error, data.step, kept)
+        z = _build_instrumental_equations(*arguments, anew)[0]
+        moves.append(_solve_instrumental_equations(z[kept[gone:]], d[kept[gone:]], rest[kept[gone:]]))
     apart = (_JACKKNIFE - 1) * np.var(moves, axis=0)
     larger = np.sqrt(np.maximum(1.0, apart / np.maximum(np.diag(equal), 1e-300)))
     many = len(fit.log_parameters)
@@ -477,7 +479,7 @@ def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
 def _filtered_derivative(
     data: _TrackingData, kind: str, logs: np.ndarray, k: int, values: np.ndarray
 ) -> np.ndarray:  # fmt: skip
-    return _filter(values, data.step, lambda s: _response_derivatives(kind, logs, s)[k])
+    return _filter_with_transfer_function(values, data.step, lambda s: _response_derivatives(kind, logs, s)[k])
 
 
 def _build_operator_fit(
@@ -490,7 +492,7 @@ def _build_operator_fit(
     for name, log, error in zip(fit.names, fit.log_parameters, errors, strict=True):
         at_bound = min(abs(log - math.log(b)) for b in _BOUNDS[name]) < 1e-3
         error = error if fit.has_converged else math.inf
-        estimates[name] = _make_estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
+        estimates[name] = _make_parameter_estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
         if at_bound or error > _MAX_LOG_ERROR:
             notes.append(f"{name} is not identifiable from this record")
     estimates["remnant"] = _estimate_remnant(fit, data)
@@ -498,7 +500,7 @@ def _build_operator_fit(
         notes.append("the sign of the hand is reversed: a positive error moves it backwards")
     first = round(_SETTLING_TIME / data.step)
     hand = fit.sign * data.hand[first:]
-    rest = hand - _predict_hand(data, fit.kind, fit.log_parameters, data.target_error)[first:]
+    rest = hand - _predict_hand_motion(data, fit.kind, fit.log_parameters, data.target_error)[first:]
     explained = 1.0 - float(np.var(rest) / np.var(hand))
     if explained < 0.3:
         notes.append(f"the target explains only {100 * explained:.0f} % of the hand's motion")
@@ -511,7 +513,7 @@ def _build_operator_fit(
     )  # fmt: skip
 
 
-def _make_estimate(log: float, error: float, unit: str, inside: bool = True) -> ParameterEstimate:
+def _make_parameter_estimate(log: float, error: float, unit: str, inside: bool = True) -> ParameterEstimate:
     reach = min(_STUDENT_QUANTILE * error, 20.0)
     low, high = math.exp(log - reach), math.exp(log + reach)
     return ParameterEstimate(math.exp(log), low, high, unit, bool(inside and error <= _MAX_LOG_ERROR))
@@ -545,7 +547,7 @@ def _estimate_remnant(fit: _EqualisationFit, data: _TrackingData) -> ParameterEs
     slopes = np.array([np.real(k / whole).mean() for k in _response_derivatives(fit.kind, fit.log_parameters, s)])
     doubt = float(slopes @ fit.covariance @ slopes)
     error = math.sqrt(1.5 / count + 4.0 * max(0.0, doubt))
-    return _make_estimate(math.log(float(share.mean())), error if fit.has_converged else math.inf, "1")
+    return _make_parameter_estimate(math.log(float(share.mean())), error if fit.has_converged else math.inf, "1")
 
 
 def _estimate_crossover(
@@ -563,14 +565,14 @@ def _estimate_crossover(
     def output_filter(s: np.ndarray) -> np.ndarray:
         return (s / (s + 1.0)) ** 2
 
-    output = _filter(signals["response"], data.step, output_filter)[first:]
+    output = _filter_with_transfer_function(signals["response"], data.step, output_filter)[first:]
     for form in range(len(FORMS)):
         for late in np.arange(0.0, 0.61, 0.02):
 
             def element_response(s: np.ndarray, form=form, late=late) -> np.ndarray:
                 return s ** (2 - form) / (s + 1.0) ** 2 * np.exp(-late * s)
 
-            effect = _filter(hand, data.step, element_response)[first:]
+            effect = _filter_with_transfer_function(hand, data.step, element_response)[first:]
             gain = float(effect @ output / max(effect @ effect, 1e-300))
             rest = float(np.sum((output - gain * effect) ** 2) / np.sum(output**2))
             best = min(best, (rest, form, gain, float(late)))

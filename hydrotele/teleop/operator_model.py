@@ -26,7 +26,7 @@ import numpy as np
 from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.units import to_si
+from hydrotele.core.units import si_unit_and_factor
 from hydrotele.logs.table import read_table
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.scenario.teleoperation import (
@@ -50,7 +50,7 @@ from hydrotele.teleop.axis_table import (
     REFLECTION_RATIO,
     SIGN,
     STIFFNESS_PER_FORCE,
-    flatten_state,
+    copy_to_contiguous_state,
     split_array,
 )
 from hydrotele.teleop.manual_control import (
@@ -60,11 +60,11 @@ from hydrotele.teleop.manual_control import (
     NOTICED_ERROR,
     VisualLoop,
     decide_hand_reference,
+    discretise_neuromuscular_lag,
     make_visual_loop,
-    neuromuscular_matrix,
 )
 from hydrotele.teleop.master import MasterParameters
-from hydrotele.teleop.operator_parameters import Operator, scenario_operator
+from hydrotele.teleop.operator_parameters import Operator, make_scenario_operator
 
 
 class PerceptionErrors(NamedTuple):
@@ -147,7 +147,7 @@ class NeuromuscularState(NamedTuple):
         gain: (1,) integral gain of the correction [1/s].
         rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
         rate: (6,) its rate.
-        lag: (6,) discrete neuromuscular lag for one control period, from `neuromuscular_matrix`.
+        lag: (6,) discrete neuromuscular lag for one control period, from `discretise_neuromuscular_lag`.
     """
 
     reference: np.ndarray
@@ -325,7 +325,7 @@ class OperatorModel:
             raise InputError("pilot.operator", message)
         self._live = hand
         self._pilot, self._behaviour = pilot, pilot.operator
-        self.parameters = him = scenario_operator(pilot.perception, folder)
+        self.parameters = him = make_scenario_operator(pilot.perception, folder)
         self._numbers, self._period = master_parameters, period
         self.ticks_per_decision = max(1, round(1.0 / (DECISION_RATE * period)))
         self._step = self.ticks_per_decision * period
@@ -381,7 +381,7 @@ class OperatorModel:
             steps=count,
         )  # fmt: skip
 
-    def decide(self, tick: int) -> None:
+    def decide_handle_reference(self, tick: int) -> None:
         """Choose the handle's reference displacement until the next decision.
 
         It is written to `muscles`.
@@ -397,11 +397,11 @@ class OperatorModel:
             return  # nothing has been observed yet
         match self._behaviour:
             case RegulateForce() | TrackForce() as pressing:
-                self._control_force(tick, pressing.approach)
+                self._control_contact_force(tick, pressing.approach)
             case SteerToPoses():
                 self._steer_tip(tick)
 
-    def _control_force(self, tick: int, approach: float) -> None:
+    def _control_contact_force(self, tick: int, approach: float) -> None:
         """Move the handle so that the contact force approaches its target.
 
         Before contact the handle moves to the fraction `approach` of its range. In contact the force is
@@ -415,8 +415,10 @@ class OperatorModel:
         if not touching:
             c = int(row[COORDINATE])
             seen = float(self._pose[tick - 1, 0, c])
-            decide_hand_reference(self.loops[c], number - 1, seen, seen, self._effective_displacement(axis, tick - 1))
-        judged = self._judge_force(tick, axis, press.push_direction, felt, looked, touching)
+            decide_hand_reference(
+                self.loops[c], number - 1, seen, seen, self._displacement_beyond_deadband(axis, tick - 1)
+            )
+        judged = self._perceive_contact_force(tick, axis, press.push_direction, felt, looked, touching)
         belief = judged if self._belief is None else self._belief.force
         self.estimated_force[number] = press.force_sign * belief
         if not touching and judged < press.contact_threshold:
@@ -424,7 +426,7 @@ class OperatorModel:
             reach = row[DEADBAND] + approach * (row[HANDLE_RANGE] - row[DEADBAND])
             wanted[axis] = press.push_direction * reach
         elif self._pilot.reflection == "direct_force" and not press.is_force_displayed:
-            self._apply_force(axis, press.push_direction, row, abs(goal), max(0, tick - self._reflex))
+            self._push_with_target_force(axis, press.push_direction, row, abs(goal), max(0, tick - self._reflex))
         else:
             self._correct_by_pushes(tick, axis, press.push_direction, press.force_sign * goal, judged)
 
@@ -506,7 +508,7 @@ class OperatorModel:
             ) ** 2
         return (him.force_weber * max(force, _MIN_TOLERANCE_RATIO * largest)) ** 2
 
-    def _judge_force(
+    def _perceive_contact_force(
         self, tick: int, axis: int, way: float, felt: int, looked: int, touching: bool
     ) -> float:  # fmt: skip
         """Return the contact force that the operator perceives at present, at least 0 [N].
@@ -526,7 +528,7 @@ class OperatorModel:
             self._imagined = max(0.0, shown + largest * self._sight[number])
             return self._imagined
         if reflection == "none":
-            beyond = way * row[SIGN] * self._effective_displacement(axis, felt)
+            beyond = way * row[SIGN] * self._displacement_beyond_deadband(axis, felt)
             if touching:
                 rate = self.loops[int(row[COORDINATE])].state[ESTIMATED_GAIN]
                 change = beyond * rate * self.parameters.task_stiffness * self._imagined_gain
@@ -547,7 +549,7 @@ class OperatorModel:
             (way * force - row[NOMINAL_STIFFNESS] * way * x) / max(row[REFLECTION_RATIO], 1e-12),
         )
 
-    def _apply_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
+    def _push_with_target_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Build up the hand force that direct reflection returns at the target, for force control.
 
         The reference follows the handle, so that the handle moves freely. `goal` is the target
@@ -559,7 +561,7 @@ class OperatorModel:
         self.muscles.spring[axis] = 0.0
         self.muscles.reference[axis] = self._handle[reflex, axis]  # force control
 
-    def _effective_displacement(self, axis: int, tick: int) -> float:
+    def _displacement_beyond_deadband(self, axis: int, tick: int) -> float:
         """Return the handle displacement that commands motion, with the sign of the coordinate.
 
         Under rate control it is the displacement beyond the dead band [m] or [rad].
@@ -577,7 +579,7 @@ class OperatorModel:
             row, wanted = self._numbers.axis[axis], self.muscles.reference
             seen, acting = (
                 float(self._pose[before, 0, c]),
-                self._effective_displacement(axis, before),
+                self._displacement_beyond_deadband(axis, before),
             )
             step = row[SIGN] * decide_hand_reference(loop, number - 1, goals[number], seen, acting)
             if self._pilot.mode == "position":
@@ -720,9 +722,9 @@ def _make_arm_at_rest(
         gain=np.array([operator.handle_position_gain]),
         rest=np.zeros(6),
         rate=np.zeros(6),
-        lag=neuromuscular_matrix(frequency, damping, period),
+        lag=discretise_neuromuscular_lag(frequency, damping, period),
     )
-    return flatten_state(at_rest)
+    return copy_to_contiguous_state(at_rest)
 
 
 def _colour_noise(white: np.ndarray, band: float, period: float) -> np.ndarray:
@@ -775,7 +777,7 @@ def read_recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
     columns, names = {}, {}
     for name, values, unit in zip(table.names, table.values, table.units, strict=True):
         if name == "time" or name.removeprefix("handle.") in AXES:
-            columns[name.removeprefix("handle.")] = values * (to_si(unit)[1] if unit else 1.0)
+            columns[name.removeprefix("handle.")] = values * (si_unit_and_factor(unit)[1] if unit else 1.0)
             names[name.removeprefix("handle.")] = name
     if len(columns) < 2 or "time" not in columns:
         wanted = ", ".join(f"handle.{axis}" for axis in AXES)

@@ -221,7 +221,7 @@ def make_operator(file: OperatorFile, number: int | None, **fixed_parameters: fl
     return Operator(**values | fixed_parameters)
 
 
-def scenario_operator(perception: OperatorSettings, folder: str = "") -> Operator:
+def make_scenario_operator(perception: OperatorSettings, folder: str = "") -> Operator:
     """Create the simulated operator that a scenario specifies.
 
     Args:
@@ -259,7 +259,7 @@ def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folde
 
     Source: `arm_impedance` for the posture; Hogan 1984 for co-contraction.
     """
-    file, him = _load_perception_file(perception, folder), scenario_operator(perception, folder)
+    file, him = _load_perception_file(perception, folder), make_scenario_operator(perception, folder)
     hand = joystick.hand
     if perception.grip:
         if perception.grip not in file.grips:
@@ -301,7 +301,7 @@ def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> Hand
     return hand.model_copy(update={"mass_shape": shapes[0], "stiffness_shape": shapes[1]})
 
 
-def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def arm_impedance(arm: ArmParameters, hand_position: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Compute the mass and stiffness of an arm at its hand, in the horizontal plane.
 
     A matrix A of the joints becomes `J^-T A J^-1` at the hand, with the Jacobian J of the hand's
@@ -309,7 +309,7 @@ def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.nd
 
     Args:
         arm: two links, with the elbow to the right of the line from shoulder to hand.
-        place: hand position, ahead and to the left of the shoulder [m].
+        hand_position: hand position, ahead and to the left of the shoulder [m].
 
     Returns:
         (2, 2) mass [kg] and stiffness [N/m], ahead and to the left.
@@ -324,7 +324,7 @@ def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.nd
     >>> arm_impedance(file.arm, (0.4, 0.0))[1].round().tolist()
     [[499.0, 22.0], [22.0, 184.0]]
     """
-    (upper, fore), (x, y) = arm.length, place
+    (upper, fore), (x, y) = arm.length, hand_position
     bend = (x * x + y * y - upper**2 - fore**2) / (2.0 * upper * fore)
     if not abs(bend) < 1.0:
         message = f"a hand at {x:g}, {y:g} m is out of reach of links of {upper:g} and {fore:g} m"

@@ -44,43 +44,43 @@ _CATCH_UP_RATE = 2.0  # 1/s, rate at which a limited reference catches up
 
 
 @compiled
-def take_received_wave(total, budget, period, end):
+def take_received_wave(wave_integral, wave_energy, period, end_state):
     """Return the received wave for this period: all sent waves minus those that were already used.
 
     It is limited so that no more energy is used than was sent.
 
     Args:
-        total: time integral of all waves that the other end had sent, from the newest packet, scalar
+        wave_integral: time integral of all waves that the other end had sent, from the newest packet, scalar
             [sqrt(J s)].
-        budget: energy of these waves, scalar [J].
+        wave_energy: energy of these waves, scalar [J].
         period: control period, scalar [s].
-        end: (8,) state of this end of the channel, written.
+        end_state: (8,) state of this end of the channel, written.
 
     Returns:
         The wave [sqrt(W)].
 
     Source: Niemeyer and Slotine 2004 (wave integrals).
     """
-    wave = (total - end[USED_SIGNAL]) / period
-    left = max(0.0, budget - end[USED_ENERGY]) / period
+    wave = (wave_integral - end_state[USED_SIGNAL]) / period
+    left = max(0.0, wave_energy - end_state[USED_ENERGY]) / period
     if wave * wave > left:
         wave = math.copysign(math.sqrt(left), wave)
-    end[USED_SIGNAL] += period * wave
-    end[USED_ENERGY] += period * wave * wave
+    end_state[USED_SIGNAL] += period * wave
+    end_state[USED_ENERGY] += period * wave * wave
     return wave
 
 
 @compiled
-def step_wave_master(v, total, budget, b, period, end):
+def step_wave_master(v, wave_integral, wave_energy, b, period, end_state):
     """Compute force and outgoing wave at the master's end of a channel with wave variables.
 
     Args:
         v: speed of the handle, scalar [m/s].
-        total: time integral of the waves that the slave had sent, scalar [sqrt(J s)].
-        budget: energy of these waves, scalar [J].
+        wave_integral: time integral of the waves that the slave had sent, scalar [sqrt(J s)].
+        wave_energy: energy of these waves, scalar [J].
         b: wave impedance, scalar [N s/m].
         period: control period, scalar [s].
-        end: (8,) state of this end of the channel, written.
+        end_state: (8,) state of this end of the channel, written.
 
     Returns:
         Force against the handle's motion [N], and the wave to send [sqrt(W)].
@@ -88,25 +88,25 @@ def step_wave_master(v, total, budget, b, period, end):
     Source: Niemeyer and Slotine 1991.
     """
     root = math.sqrt(2.0 * b)
-    w = take_received_wave(total, budget, period, end)
+    w = take_received_wave(wave_integral, wave_energy, period, end_state)
     pushed = b * v - root * w
-    end[STORED_ENERGY] += period * pushed * v
+    end_state[STORED_ENERGY] += period * pushed * v
     return pushed, root * v - w
 
 
 @compiled
-def step_wave_slave(v, total, budget, stiffness, damping, b, period, end):
+def step_wave_slave(v, wave_integral, wave_energy, stiffness, damping, b, period, end_state):
     """Compute force and outgoing wave at the slave's end of a channel with wave variables.
 
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
-        total: time integral of the waves that the master had sent, scalar [sqrt(J s)].
-        budget: energy of these waves, scalar [J].
+        wave_integral: time integral of the waves that the master had sent, scalar [sqrt(J s)].
+        wave_energy: energy of these waves, scalar [J].
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
         b: wave impedance, scalar [N s/m].
         period: control period, scalar [s].
-        end: (8,) state of this end of the channel, written.
+        end_state: (8,) state of this end of the channel, written.
 
     Returns:
         Force on the slave [N], and the wave to send back [sqrt(W)].
@@ -114,17 +114,17 @@ def step_wave_slave(v, total, budget, stiffness, damping, b, period, end):
     Source: Niemeyer and Slotine 1991; backward differences.
     """
     less = math.sqrt(2.0 / b)
-    u = take_received_wave(total, budget, period, end)
+    u = take_received_wave(wave_integral, wave_energy, period, end_state)
     stiff = damping + stiffness * period
-    pull = (stiffness * end[SPRING_DEFLECTION] + stiff * (less * u - v)) / (1.0 + stiff / b)
+    pull = (stiffness * end_state[SPRING_DEFLECTION] + stiff * (less * u - v)) / (1.0 + stiff / b)
     asked = less * u - pull / b
-    end[SPRING_DEFLECTION] += period * (asked - v)
-    end[STORED_ENERGY] -= period * pull * asked
+    end_state[SPRING_DEFLECTION] += period * (asked - v)
+    end_state[STORED_ENERGY] -= period * pull * asked
     return pull, u - less * pull
 
 
 @compiled
-def step_passivity_master(v, force, budget, mass, period, end):
+def step_passivity_master(v, force, slave_energy, mass, period, end_state):
     """Compute the force at the master's end under passivity control.
 
     The received force is limited so that no more energy leaves here than has entered at the slave.
@@ -135,33 +135,33 @@ def step_passivity_master(v, force, budget, mass, period, end):
     Args:
         v: mean speed of the handle over the last period, scalar [m/s].
         force: received force against the handle's motion, scalar [N].
-        budget: energy that had entered at the slave at the time of sending, scalar [J].
+        slave_energy: energy that had entered at the slave at the time of sending, scalar [J].
         mass: mass of the master, scalar [kg].
         period: control period, scalar [s].
-        end: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
+        end_state: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
 
     Returns:
         The applied force against the handle's motion [N].
 
     Source: passivity condition of Hannaford and Ryu 2002, solved for the force.
     """
-    gone = end[MASTER_FORCE] * v * period
-    end[STORED_ENERGY] += gone
-    end[ENERGY_IN] += max(gone, 0.0)
-    end[ENERGY_OUT] += max(-gone, 0.0)
-    firm, left = mass / period, budget - end[ENERGY_OUT]
+    gone = end_state[MASTER_FORCE] * v * period
+    end_state[STORED_ENERGY] += gone
+    end_state[ENERGY_IN] += max(gone, 0.0)
+    end_state[ENERGY_OUT] += max(-gone, 0.0)
+    firm, left = mass / period, slave_energy - end_state[ENERGY_OUT]
     if left < 0.0:
-        end[MASTER_FORCE] = _damping_force(v, force, -left / period, 0.5 * firm)
-        return end[MASTER_FORCE]
-    now = v - 0.5 / firm * end[MASTER_FORCE]
+        end_state[MASTER_FORCE] = _power_dissipating_force(v, force, -left / period, 0.5 * firm)
+        return end_state[MASTER_FORCE]
+    now = v - 0.5 / firm * end_state[MASTER_FORCE]
     # -F x <= E with x = v T - F T^2 / (2 M) is quadratic in F
     root = math.sqrt(now * now + 2.0 * left / mass)
-    end[MASTER_FORCE] = min(firm * (now + root), max(firm * (now - root), force))
-    return end[MASTER_FORCE]
+    end_state[MASTER_FORCE] = min(firm * (now + root), max(firm * (now - root), force))
+    return end_state[MASTER_FORCE]
 
 
 @compiled
-def _damping_force(v, force, power, most):
+def _power_dissipating_force(v, force, power, most):
     """Return a damping force against speed v that dissipates a power, at most `most` times the speed.
 
     It is the received force `force` if that dissipates more.
@@ -175,7 +175,7 @@ def _damping_force(v, force, power, most):
 
 
 @compiled
-def step_passivity_slave(v, place, budget, stiffness, damping, min_power, period, end):
+def step_passivity_slave(v, place, master_energy, stiffness, damping, min_power, period, end_state):
     """Compute the force at the slave's end under passivity control.
 
     The force is that of a spring and damper between the received handle position and the slave. The
@@ -185,31 +185,34 @@ def step_passivity_slave(v, place, budget, stiffness, damping, min_power, period
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
         place: position of the handle in the newest packet, scalar [m].
-        budget: energy that had entered at the master at the time of sending, scalar [J].
+        master_energy: energy that had entered at the master at the time of sending, scalar [J].
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
         min_power: power that is always permitted, scalar [W].
         period: control period, scalar [s].
-        end: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
+        end_state: (8,) state of this end, written; the caller sends its ENERGY_IN in the next packet.
 
     Returns:
         Force on the slave [N].
 
     Source: passivity condition of Ryu, Artigas and Preusche 2010, solved for the reference.
     """
-    asked = _CATCH_UP_RATE * (end[RECEIVED_POSITION] - end[USED_SIGNAL]) + (place - end[RECEIVED_POSITION]) / period
-    end[RECEIVED_POSITION], end[REPORTED_ENERGY] = place, budget
+    asked = (
+        _CATCH_UP_RATE * (end_state[RECEIVED_POSITION] - end_state[USED_SIGNAL])
+        + (place - end_state[RECEIVED_POSITION]) / period
+    )
+    end_state[RECEIVED_POSITION], end_state[REPORTED_ENERGY] = place, master_energy
     stiff = damping + stiffness * period
-    offset = stiffness * end[SPRING_DEFLECTION] - stiff * v
-    power = min_power + max(0.0, budget - end[ENERGY_OUT]) / period
+    offset = stiffness * end_state[SPRING_DEFLECTION] - stiff * v
+    power = min_power + max(0.0, master_energy - end_state[ENERGY_OUT]) / period
     # (offset + stiff rate) rate <= power
     root = math.sqrt(offset * offset + 4.0 * stiff * power)
     asked = min((-offset + root) / (2.0 * stiff), max((-offset - root) / (2.0 * stiff), asked))
     pull = offset + stiff * asked
-    end[USED_SIGNAL] += period * asked
-    end[SPRING_DEFLECTION] += period * (asked - v)
+    end_state[USED_SIGNAL] += period * asked
+    end_state[SPRING_DEFLECTION] += period * (asked - v)
     gone = -pull * asked * period
-    end[STORED_ENERGY] += gone
-    end[ENERGY_IN] += max(gone, 0.0)
-    end[ENERGY_OUT] += max(-gone - min_power * period, 0.0)
+    end_state[STORED_ENERGY] += gone
+    end_state[ENERGY_IN] += max(gone, 0.0)
+    end_state[ENERGY_OUT] += max(-gone - min_power * period, 0.0)
     return pull

@@ -18,8 +18,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.machine.joystick import HandImpedance
-from hydrotele.teleop.axis_table import flatten_state
-from hydrotele.teleop.manual_control import neuromuscular_matrix
+from hydrotele.teleop.axis_table import copy_to_contiguous_state
+from hydrotele.teleop.manual_control import discretise_neuromuscular_lag
 from hydrotele.teleop.operator_model import (
     REFLEX_DELAY,
     NeuromuscularState,
@@ -92,12 +92,12 @@ def _make_operator_arm(operator: Operator, hand: HandImpedance, expected: float)
     The experiment uses axis 0 only.
     """
     zero = np.zeros(6)
-    return flatten_state(NeuromuscularState(
+    return copy_to_contiguous_state(NeuromuscularState(
         reference=zero, spring=zero + expected, detent=np.full((3, 6), -1.0), correction=zero,
         force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), max_force=zero + operator.max_force,
         weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
         gain=np.array([operator.handle_position_gain]), rest=zero, rate=zero,
-        lag=neuromuscular_matrix(operator.neuromuscular_frequency, 1.0, _PERIOD),
+        lag=discretise_neuromuscular_lag(operator.neuromuscular_frequency, 1.0, _PERIOD),
     ))  # fmt: skip
 
 
@@ -124,7 +124,7 @@ def measure_discrimination(
     every, levels = round(_DECISION_PERIOD / _PERIOD), np.array(_LEVELS[sense])
     decisions = ticks // every
 
-    def perceive(value: float) -> float:
+    def simulate_perceived_value(value: float) -> float:
         errors = draw_perception_errors(operator, rng, decisions, _DECISION_PERIOD)
         spring, load = (value, 0.0) if sense == "stiffness" else (0.0, value)
         muscles = _make_operator_arm(operator, hand, reference if sense == "stiffness" else 0.0)
@@ -139,7 +139,7 @@ def measure_discrimination(
             pair = [reference, reference * (1.0 + level)]
             if swapped := rng.random() < 0.5:
                 pair.reverse()
-            felt = [perceive(value) for value in pair]
+            felt = [simulate_perceived_value(value) for value in pair]
             greater[k] += (felt[0] > felt[1]) == swapped
     bias, spread, error = fit_psychometric_function(levels, greater, trials)
     root = math.sqrt(2.0)  # the responses contain the noise of both intervals
@@ -187,17 +187,17 @@ def fit_psychometric_function(
     from scipy.optimize import minimize
     from scipy.special import ndtr
 
-    def share(x: np.ndarray) -> np.ndarray:
+    def greater_probability(x: np.ndarray) -> np.ndarray:
         return lapse + (1.0 - 2.0 * lapse) * ndtr((levels - x[0]) / math.exp(x[1]))
 
-    def likelihood(x: np.ndarray) -> float:
-        p = share(x)
+    def negative_log_likelihood(x: np.ndarray) -> float:
+        p = greater_probability(x)
         return -float(np.sum(greater * np.log(p) + (trials - greater) * np.log(1.0 - p)))
 
-    found = minimize(likelihood, np.array([0.0, math.log(0.3 * np.ptp(levels))]), method="Nelder-Mead").x
+    found = minimize(negative_log_likelihood, np.array([0.0, math.log(0.3 * np.ptp(levels))]), method="Nelder-Mead").x
     step = 1e-3
-    slopes = [_finite_difference(share, found, k, step) for k in range(2)]
-    p = share(found)
+    slopes = [_finite_difference(greater_probability, found, k, step) for k in range(2)]
+    p = greater_probability(found)
     information = np.array([
         [np.sum(trials * a * b / (p * (1.0 - p))) for a in slopes] for b in slopes
     ])  # fmt: skip

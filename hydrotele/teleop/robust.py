@@ -22,7 +22,7 @@ from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
     PacketAges,
     StabilityPrediction,
-    growth_rate,
+    compute_max_growth_rate,
     predict_stability,
 )
 from hydrotele.teleop.two_port import (
@@ -42,7 +42,7 @@ _ROUNDING = 1e-6
 _STIFFNESS_FACTORS = np.geomspace(1e-3, 1e4, 57)  # tested factors on the task's stiffness
 
 
-def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
+def compute_llewellyn_parameter(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     """Return Llewellyn's stability parameter of a two-port at frequencies.
 
     The two-port is absolutely stable (stable with every passive hand and task) if the parameter is
@@ -60,7 +60,7 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
     >>> from hydrotele.teleop.two_port import make_two_port
     >>> body, firm = Impedance(1.0), Impedance(0.0, 40.0, 400.0)
-    >>> float(llewellyn(make_two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
+    >>> float(compute_llewellyn_parameter(make_two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
     1.0
     """
     h = hybrid_matrix(port, np.asarray(s, complex))
@@ -83,7 +83,7 @@ def is_absolutely_stable(port: TwoPort) -> bool:
         True if its hybrid matrix has no pole in the right half-plane and Llewellyn's parameter is
         nowhere below 1.
     """
-    if np.any(llewellyn(port, 1j * _SEARCH_FREQUENCIES) < 1.0 - _ROUNDING):
+    if np.any(compute_llewellyn_parameter(port, 1j * _SEARCH_FREQUENCIES) < 1.0 - _ROUNDING):
         return False
     try:
         return count_unstable_poles_held(port, _ZERO_IMPEDANCE) == 0
@@ -113,7 +113,7 @@ class ZWidth:
     max_tested_stiffness: float
 
     @property
-    def decades(self) -> float:
+    def mean_width_decades(self) -> float:
         """Width of the displayed impedance range in decades, averaged over the frequencies.
 
         It is the mean of `log10(|Z_clamped| / |Z_free|)` of the two displayed impedances [1].
@@ -143,13 +143,13 @@ def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndar
     unit = case.task.stiffness or case.slave_control.stiffness or 1.0
 
     def find_max_stiffness(hand: Impedance) -> float:
-        def right(factor: float) -> bool:
+        def is_stable_with(factor: float) -> bool:
             task = replace(case.task, stiffness=factor * unit)
             return is_strictly_stable(port_with_task(case, structure, task), hand, task)
 
-        if not right(float(_STIFFNESS_FACTORS[0])):
+        if not is_stable_with(float(_STIFFNESS_FACTORS[0])):
             return 0.0
-        found = find_first_change(right, _STIFFNESS_FACTORS)
+        found = find_first_change(is_stable_with, _STIFFNESS_FACTORS)
         return math.inf if found is None else found * unit
 
     most = float(_STIFFNESS_FACTORS[-1]) * unit
@@ -181,7 +181,9 @@ class MasterPolynomial:
     unstable_zeros: int
 
 
-def master_polynomial(case: TeleoperatorAxis, structure: str, hand: Impedance = _ZERO_IMPEDANCE) -> MasterPolynomial:
+def compute_master_polynomial(
+    case: TeleoperatorAxis, structure: str, hand: Impedance = _ZERO_IMPEDANCE
+) -> MasterPolynomial:
     """Compute the characteristic polynomial of the master without return channels.
 
     The master is held by a hand (h) or released. Z_m is the master's impedance and C_m its controller
@@ -306,7 +308,7 @@ class SampledStability:
     worst_task: Impedance
 
 
-def evaluate_sampled_pairs(
+def evaluate_random_hands_and_tasks(
     case: TeleoperatorAxis,
     structure: str,
     line: PacketAges,
@@ -339,7 +341,7 @@ def evaluate_sampled_pairs(
         one = replace(case, hand=hand, task=task)
         unstable += not predict_stability(one, structure, line).is_stable
         free += not predict_stability(replace(one, hand=_ZERO_IMPEDANCE), structure, line).is_stable
-        rate = growth_rate(one, structure, line)
+        rate = compute_max_growth_rate(one, structure, line)
         if rate > worst[0]:
             worst = rate, hand, task
     return SampledStability(pairs, unstable, free, *worst)
@@ -404,9 +406,9 @@ def evaluate_robustness(
     return Robustness(
         structure,
         is_absolutely_stable(port) if port else None,
-        float(llewellyn(port, 1j * _SEARCH_FREQUENCIES).min()) if port else math.nan,
+        float(compute_llewellyn_parameter(port, 1j * _SEARCH_FREQUENCIES).min()) if port else math.nan,
         compute_z_width(case, structure) if linear else None,
-        master_polynomial(case, structure) if linear else None,
+        compute_master_polynomial(case, structure) if linear else None,
         (four[0], four[1], four[2], four[3]),
-        evaluate_sampled_pairs(case, structure, line, spread, pairs),
+        evaluate_random_hands_and_tasks(case, structure, line, spread, pairs),
     )

@@ -26,7 +26,7 @@ from hydrotele.teleop.master import (
     SENT_SIGNAL,
     WAVE_VARIABLES,
     step_master,
-    unpack_master,
+    unpack_master_parameters,
     unpack_master_state,
 )
 from hydrotele.teleop.operator_model import compute_muscle_forces, unpack_neuromuscular_state
@@ -39,7 +39,7 @@ from hydrotele.teleop.slave import (
     VALVES_CLOSED,
     measure_tip,
     step_slave,
-    unpack_slave,
+    unpack_slave_parameters,
     unpack_slave_state,
     write_machine_packet,
 )
@@ -97,7 +97,7 @@ def delays_to_periods(delays: np.ndarray, period: float) -> np.ndarray:
     return rounded.astype(int)
 
 
-def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+def load_packet_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """Read the measured delays of network packets in both directions from a CSV file.
 
     Args:
@@ -205,7 +205,7 @@ class MasterSide(NamedTuple):
 
 
 @compiled
-def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
+def step_master_side(tick, has_new_sample, elapsed, tripped, machine, line, operator):
     """Run the first half of a control tick, up to the forces on the joystick's handle.
 
     The machine's packet is written to the channel, the master receives the newest packet, and the coil
@@ -213,7 +213,7 @@ def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
 
     Args:
         tick: number of the control tick, scalar.
-        fresh: whether the sensors have a new sample, scalar.
+        has_new_sample: whether the sensors have a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
         tripped: whether the machine has been stopped permanently, scalar.
         machine: SlaveSide.
@@ -229,13 +229,13 @@ def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
     forward, back, packet, age, state = line
     master_flat, master_state, qpos, hand_flat, past, tremor = operator
     k = len(columns)
-    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    slave, s = unpack_slave_parameters(slave_flat, k), unpack_slave_state(state_flat, k)
     m, hand = unpack_master_state(master_state), unpack_neuromuscular_state(hand_flat)
     period, rows = state[PERIOD], len(back)
     arm = np.empty(k)
     for i in range(k):
         arm[i] = joint[columns[i]]
-    measure_tip(slave, arm, fresh, elapsed, s)
+    measure_tip(slave, arm, has_new_sample, elapsed, s)
     write_machine_packet(slave, force, s, back[tick % rows])
     late = age[tick % len(age), 1]
     if late < 0:
@@ -249,7 +249,7 @@ def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
                     packet[row, i] = come[row, i]
     goal = 0.0 if tripped or state[SILENT_TIME] > state[MAX_SILENT_TIME] else 1.0
     state[PACKET_GAIN] += (goal - state[PACKET_GAIN]) * min(1.0, period / state[FADE_OUT_TIME])
-    numbers = unpack_master(master_flat)
+    numbers = unpack_master_parameters(master_flat)
     step_master(numbers, qpos, packet, state[PACKET_GAIN], period, tick == 0, m)
     compute_muscle_forces(hand, past, tremor, m.handle, tick, period)
     ahead = forward[tick % len(forward)]
@@ -290,7 +290,7 @@ def step_slave_side(tick, machine, line, grid, table, scale, reference, rate, dr
     forward, _, _, age, state = line
     velocity, arm, volume_head, volume_rod = drive
     k, rows = len(columns), len(forward)
-    slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
+    slave, s = unpack_slave_parameters(slave_flat, k), unpack_slave_state(state_flat, k)
     measured = np.empty(k)
     for i in range(k):
         measured[i] = joint[columns[i]]
@@ -370,7 +370,7 @@ def step_teleoperation(station, flotor, tick, tripped):
     s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
     force, n, nu = unpack_neuromuscular_state(operator.muscles).force, r.ticks, r.axes
     if r.simulated:
-        unpack_master(operator.master).max_current[0] = flotor[0].allowed
+        unpack_master_parameters(operator.master).max_current[0] = flotor[0].allowed
         if r.swing < 0:
             flotor_step(flotor[0], m.currents, force)
         else:

@@ -148,7 +148,7 @@ class _SampledSide:
         """Numerator of the speed as a controller computes it: backward difference of the position."""
         return self.position * (1.0 - self.q) / self.period
 
-    def digital_force(self, z: Impedance) -> np.ndarray:
+    def digital_controller_force(self, z: Impedance) -> np.ndarray:
         """Return the force of a digital controller with mass, damping and stiffness z.
 
         It uses sampled positions, their differences, and the measured acceleration; a numerator over
@@ -189,8 +189,8 @@ def wave_impedance(case: TeleoperatorAxis) -> float:
     return case.wave or case.slave_control.damping or 1.0
 
 
-def sampled_characteristic(
-    case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
+def sampled_characteristic_function(
+    case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, return_gain: float = 1.0
 ) -> np.ndarray:
     """Return the characteristic function of the sampled loop at points q of the unit delay.
 
@@ -201,7 +201,7 @@ def sampled_characteristic(
         structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
         line: control period and distribution of the ages of packets.
         q: (...) complex points.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         (...) complex values.
@@ -217,16 +217,16 @@ def sampled_characteristic(
     q = np.asarray(q, complex)
     ahead, home = (
         _mean_channel_response(line.forward, q),
-        reflected * _mean_channel_response(line.back, q),
+        return_gain * _mean_channel_response(line.back, q),
     )
     near = _make_sampled_side(case.master, case.hand, line.period, q)
     far = _make_sampled_side(case.slave, case.task, line.period, q)
     if structure in (WAVE_STRUCTURE, PASSIVITY_STRUCTURE):
-        home = reflected * _mean_return_response(line, q)
+        home = return_gain * _mean_return_response(line, q)
         return _series_characteristic(case, structure == WAVE_STRUCTURE, near, far, ahead, home)
-    own, forward = _master_laws(case, structure, near)
-    own_slave = far.digital_force(case.slave_control)
-    back = _slave_law(case, structure, far)
+    own, forward = _master_side_forces(case, structure, near)
+    own_slave = far.digital_controller_force(case.slave_control)
+    back = _slave_side_force(case, structure, far)
     free = near.denominator * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
     return (free + own) * (far.denominator + own_slave) - ahead * home * forward * back
 
@@ -250,7 +250,7 @@ def _mean_return_response(line: PacketAges, q: np.ndarray) -> np.ndarray:
     return _mean_channel_response(line.back, q) - line.back[0] * (1.0 - q)
 
 
-def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> tuple[np.ndarray, np.ndarray]:
+def _master_side_forces(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> tuple[np.ndarray, np.ndarray]:
     """Return the forces of the control law that depend on the master's motion.
 
     They are the force of the master's own controller, and the force on the slave before the channel.
@@ -258,10 +258,14 @@ def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> 
     """
     firm, own, gains = case.slave_control, case.master_control, case.gains
     if structure not in RATE_STRUCTURES:
-        forward = gains.position * near.digital_force(firm)
+        forward = gains.position * near.digital_controller_force(firm)
         if structure == "four_channel_position":
-            forward = near.digital_force(firm) + near.digital_force(case.slave) - near.physical_force(case.hand)
-        return near.digital_force(own), forward
+            forward = (
+                near.digital_controller_force(firm)
+                + near.digital_controller_force(case.slave)
+                - near.physical_force(case.hand)
+            )
+        return near.digital_controller_force(own), forward
     step = 1.0 - near.q
 
     def rate_force(z: Impedance) -> np.ndarray:
@@ -269,22 +273,22 @@ def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> 
 
     forward = rate_force(firm)
     if structure == "rate_force":
-        return step * near.digital_force(own), forward
+        return step * near.digital_controller_force(own), forward
     if structure == "four_channel_rate":
         forward = forward - gains.velocity * near.period * near.physical_force(case.hand)
     return rate_force(own), forward
 
 
-def _slave_law(case: TeleoperatorAxis, structure: str, far: _SampledSide) -> np.ndarray:
+def _slave_side_force(case: TeleoperatorAxis, structure: str, far: _SampledSide) -> np.ndarray:
     """Return the force on the master that depends on the slave's motion, before the return channel.
 
     It is a numerator over the slave's denominator.
     """
     if structure in ("position_force", "rate_force"):
         return -case.gains.force * far.physical_force(case.task)
-    back = far.digital_force(case.master_control)
+    back = far.digital_controller_force(case.master_control)
     if structure == "four_channel_position":
-        back = back + far.digital_force(case.master) - far.physical_force(case.task)
+        back = back + far.digital_controller_force(case.master) - far.physical_force(case.task)
     if structure == "four_channel_rate":
         change = far.physical_force(case.task) * (1.0 - far.q) / far.period
         back = back - change / case.gains.velocity
@@ -320,7 +324,9 @@ def _series_characteristic(
     return master * first - second
 
 
-def growth_rate(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+def compute_max_growth_rate(
+    case: TeleoperatorAxis, structure: str, line: PacketAges, return_gain: float = 1.0
+) -> float:
     """Return the growth rate of the fastest growing motion of the sampled loop.
 
     It is negative if all motions decay; constant positions of a free handle do not count.
@@ -329,7 +335,7 @@ def growth_rate(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
         case: teleoperator with hand and task; its delays are replaced by those of the channel.
         structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
         line: control period and distribution of the ages of packets.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         Rate sigma of the motion `exp(sigma t)` [1/s], between -2000 and 2000.
@@ -337,7 +343,7 @@ def growth_rate(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
     Raises:
         InputError: the structure is not known, or a pole lies on the contour.
     """
-    return _find_growth_rate(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
+    return _find_growth_rate(lambda q: sampled_characteristic_function(case, structure, line, q, return_gain), line)
 
 
 def _find_growth_rate(function, line: PacketAges) -> float:
@@ -402,7 +408,9 @@ def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
     far, firm = _make_sampled_side(case.slave, case.task, line.period, q), case.slave_control
     held = firm.damping * (1.0 - q) + firm.stiffness * line.period
     port = held * far.denominator / ((1.0 - q) * far.denominator + held * far.rate)
-    grows = _count_zeros_inside(lambda p: slave_characteristic(case, line, p), math.exp(_MIN_GROWTH_RATE * line.period))
+    grows = _count_zeros_inside(
+        lambda p: slave_characteristic_function(case, line, p), math.exp(_MIN_GROWTH_RATE * line.period)
+    )
     return bool(np.all(port.real > -1e-6 * np.abs(port))) and not grows
 
 
@@ -416,13 +424,13 @@ def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q:
         master = (b * near.rate - near.denominator) / (b * near.rate + near.denominator)
         share = b * (1.0 - q) + held
         return master, 1.0 - 2.0 * held * far.denominator / (share * far.denominator + b * held * far.rate)
-    own, forward = _master_laws(case, structure, near)
+    own, forward = _master_side_forces(case, structure, near)
     free = near.denominator * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
-    back = reflected * _slave_law(case, structure, far)
-    return forward / (free + own), back / (far.denominator + far.digital_force(case.slave_control))
+    back = reflected * _slave_side_force(case, structure, far)
+    return forward / (free + own), back / (far.denominator + far.digital_controller_force(case.slave_control))
 
 
-def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, return_gain: float = 1.0) -> float:
     """Return the mean-square loop gain of the noise that jitter causes.
 
     A channel whose packets have random ages transmits the fraction `E(q)` of a signal. It adds noise
@@ -434,7 +442,7 @@ def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
         case: teleoperator with hand and task.
         structure: one of `SAMPLED_STRUCTURES` except `passivity_control`.
         line: control period and distribution of the ages of packets.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         The spectral radius [1], valid only if the mean loop is stable. Below 1 the mean square
@@ -444,7 +452,7 @@ def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
     """
     angle = np.geomspace(1e-4, math.pi, 6000)
     q = np.exp(-1j * angle)
-    master, slave = _side_responses(case, structure, line, q, reflected)
+    master, slave = _side_responses(case, structure, line, q, return_gain)
     ahead = _mean_channel_response(line.forward, q)
     home = _mean_return_response(line, q) if structure == WAVE_STRUCTURE else _mean_channel_response(line.back, q)
     left = 1.0 - master * slave * ahead * home
@@ -457,7 +465,7 @@ def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflec
     return float(np.abs(np.linalg.eigvals(table)).max())
 
 
-def slave_characteristic(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray) -> np.ndarray:
+def slave_characteristic_function(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray) -> np.ndarray:
     """Return the characteristic function of the slave alone, with a constant reference.
 
     It contains slave, its sampled controller and task, and is 0 at the poles `z = 1/q`.
@@ -471,7 +479,7 @@ def slave_characteristic(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray
         (...) complex values.
     """
     far = _make_sampled_side(case.slave, case.task, line.period, np.asarray(q, complex))
-    return far.denominator + far.digital_force(case.slave_control)
+    return far.denominator + far.digital_controller_force(case.slave_control)
 
 
 @dataclass(frozen=True)
@@ -490,7 +498,7 @@ class StabilityPrediction:
 
 
 def predict_stability(
-    case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0
+    case: TeleoperatorAxis, structure: str, line: PacketAges, return_gain: float = 1.0
 ) -> StabilityPrediction:
     """Predict whether a teleoperator is stable with sampling and variable packet delays.
 
@@ -501,7 +509,7 @@ def predict_stability(
         case: teleoperator with hand and task.
         structure: one of `SAMPLED_STRUCTURES`.
         line: control period and distribution of the ages of packets.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         Whether it is stable, and the criterion that decided.
@@ -511,17 +519,17 @@ def predict_stability(
     """
 
     def loop_function(q: np.ndarray) -> np.ndarray:
-        return sampled_characteristic(case, structure, line, q, reflected)
+        return sampled_characteristic_function(case, structure, line, q, return_gain)
 
     def slave_function(q: np.ndarray) -> np.ndarray:
-        return slave_characteristic(case, line, q)
+        return slave_characteristic_function(case, line, q)
 
     slowest = math.exp(-_MIN_GROWTH_RATE * line.period)
     steady = _count_zeros_inside(loop_function, slowest) == 0
     if structure != PASSIVITY_STRUCTURE:
         if not steady:
             return StabilityPrediction(False, "poles")
-        if jitter_gain(case, structure, line, reflected) >= _MAX_JITTER_GAIN:
+        if jitter_gain(case, structure, line, return_gain) >= _MAX_JITTER_GAIN:
             return StabilityPrediction(False, "jitter")
         return StabilityPrediction(True, "poles")
     if steady:
@@ -581,7 +589,7 @@ def make_spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 
     return HandleBody(np.array([[inertia]]), np.array([[stiffness]]), np.array([[damping]]))
 
 
-def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
+def max_sampled_handle_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
     """Return the largest eigenvalue magnitude of a handle under sampled spring and damper control.
 
     Below 1 the handle comes to rest; the map is that of one control period.
@@ -600,8 +608,8 @@ def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.nda
 
     Source: zero-order hold by the matrix exponential; speed as the difference of two readings.
 
-    >>> held = max_loop_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([0.25]), 5e-3)
-    >>> shaken = max_loop_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([3.0]), 5e-3)
+    >>> held = max_sampled_handle_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([0.25]), 5e-3)
+    >>> shaken = max_sampled_handle_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([3.0]), 5e-3)
     >>> held < 1.0 < shaken
     True
     """
@@ -620,7 +628,7 @@ def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.nda
     return float(np.abs(np.linalg.eigvals(loop)).max())
 
 
-def max_stable_damping(inertia: float, stiffness: float, period: float) -> float:
+def max_stable_handle_damping(inertia: float, stiffness: float, period: float) -> float:
     """Return the maximum sampled damping with which a handle that spins about its axis is stable.
 
     Args:
@@ -631,15 +639,15 @@ def max_stable_damping(inertia: float, stiffness: float, period: float) -> float
     Returns:
         Damping [N m s/rad]; 0 if no damping stabilises this spring.
 
-    Source: `max_loop_eigenvalue`; without a spring it is 2 inertia / period.
+    Source: `max_sampled_handle_eigenvalue`; without a spring it is 2 inertia / period.
 
-    >>> round(max_stable_damping(1.5e-3, 0.0, 5e-3), 6)
+    >>> round(max_stable_handle_damping(1.5e-3, 0.0, 5e-3), 6)
     0.6
     """
     body = make_spinning_body(inertia)
 
     def is_stable(damping: float) -> bool:
-        decay = max_loop_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
+        decay = max_sampled_handle_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
         return decay < 1.0 + 1e-12
 
     tried = np.geomspace(1e-3, 1.0, 400) * 2.0 * inertia / period
@@ -653,7 +661,7 @@ def max_stable_damping(inertia: float, stiffness: float, period: float) -> float
     return float(low)
 
 
-def min_stable_inertia(damping: float, stiffness: float, period: float) -> float:
+def min_stable_handle_inertia(damping: float, stiffness: float, period: float) -> float:
     """Return the minimum inertia with which a spinning handle is stable at a given sampled damping.
 
     Args:
@@ -664,15 +672,15 @@ def min_stable_inertia(damping: float, stiffness: float, period: float) -> float
     Returns:
         Moment of inertia [kg m^2]; infinite if there is none below 1e6.
 
-    Source: `max_loop_eigenvalue`; without a spring it is damping period / 2.
+    Source: `max_sampled_handle_eigenvalue`; without a spring it is damping period / 2.
 
-    >>> round(min_stable_inertia(3.0, 0.0, 5e-3), 6)
+    >>> round(min_stable_handle_inertia(3.0, 0.0, 5e-3), 6)
     0.0075
     """
 
     def is_stable(inertia: float) -> bool:
         body = make_spinning_body(inertia)
-        decay = max_loop_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
+        decay = max_sampled_handle_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
         return decay < 1.0 + 1e-12
 
     low = high = 0.5 * damping * period

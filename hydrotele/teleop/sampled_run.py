@@ -65,7 +65,7 @@ class KickResponse(NamedTuple):
         return bool(self.max_speeds[self.max_speeds > 0.0][-1] < 1e-3 * _INITIAL_SPEEDS.max())
 
 
-def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> np.ndarray:
+def control_coefficients(case: TeleoperatorAxis, structure: str, return_gain: float = 1.0) -> np.ndarray:
     """Return the control laws of a structure as coefficients on the seven signals of each side.
 
     The signals are those that the constants SUM to FORCE of this module number.
@@ -73,7 +73,7 @@ def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: floa
     Args:
         case: the teleoperator.
         structure: one of `two_port.STRUCTURES`.
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         (4, 7) rows: own force of the master, force on the slave from the master's packet, own force of
@@ -85,35 +85,35 @@ def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: floa
     made, gains, rate = np.zeros((4, _SIGNALS)), case.gains, structure in RATE_STRUCTURES
     own, forward, slave, back = made
 
-    def add(row: np.ndarray, z: Impedance, place: int, factor: float = 1.0) -> None:
+    def add_impedance(row: np.ndarray, z: Impedance, place: int, factor: float = 1.0) -> None:
         row[place : place + 2] += factor * np.array([z.stiffness, z.damping])
         if place == X:
             row[A] += factor * z.mass
 
-    add(slave, case.slave_control, X)
+    add_impedance(slave, case.slave_control, X)
     ahead = gains.velocity if rate else gains.position
     if structure == "four_channel_position":
         ahead = 1.0
-    add(forward, case.slave_control, SUM if rate else X, ahead)
+    add_impedance(forward, case.slave_control, SUM if rate else X, ahead)
     shared = structure in ("rate_position", "four_channel_rate")
-    add(own, case.master_control, SUM if shared else X, gains.velocity if shared else 1.0)
+    add_impedance(own, case.master_control, SUM if shared else X, gains.velocity if shared else 1.0)
     if structure in ("position_force", "rate_force"):
         back[FORCE] = -gains.force
     else:
-        add(back, case.master_control, X)
+        add_impedance(back, case.master_control, X)
     if structure == "four_channel_position":
-        add(forward, case.slave, X)
-        add(back, case.master, X)
+        add_impedance(forward, case.slave, X)
+        add_impedance(back, case.master, X)
         forward[FORCE], back[FORCE] = -1.0, -1.0
     if structure == "four_channel_rate":
         forward[IMPULSE], back[FORCE_RATE] = -gains.velocity, -1.0 / gains.velocity
-    back *= reflected
+    back *= return_gain
     return made
 
 
-def simulate_kick(
+def simulate_initial_velocities(
     case: TeleoperatorAxis, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
-    reflected: float = 1.0,
+    return_gain: float = 1.0,
 ) -> KickResponse:  # fmt: skip
     """Simulate a sampled teleoperator packet by packet, after initial velocities of both sides.
 
@@ -124,7 +124,7 @@ def simulate_kick(
         delays_forward: (n,) delay of the packet sent in each of the n periods of the run [s]; NaN
             if lost.
         delays_back: (n,) the same for the slave's packets [s].
-        reflected: factor on the return channels [1].
+        return_gain: factor on the return channels [1].
 
     Returns:
         Speeds, growth and energy of the run.
@@ -136,7 +136,7 @@ def simulate_kick(
     if structure in (WAVE_STRUCTURE, PASSIVITY_STRUCTURE):
         way = _WAVES if structure == WAVE_STRUCTURE else _CONTROLLED
     else:
-        table = control_coefficients(case, structure, reflected)
+        table = control_coefficients(case, structure, return_gain)
     ages = [compute_packet_ages(delays_to_periods(d, period)) for d in (delays_forward, delays_back)]
     firm = case.slave_control
     bodies = np.array([
@@ -195,7 +195,7 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
     ends, come = np.zeros((2, END_SIZE)), np.zeros((2, _SIGNALS))
     for n in range(count):
         for side in range(2):
-            _measure(bodies[side], state[side], force[side], period, seen[side])
+            _sample_side_signals(bodies[side], state[side], force[side], period, seen[side])
         newest = n - age_forward[n], n - age_back[n]
         if way == _LINEAR:
             sent[0, n], sent[1, n] = seen[0], seen[1]
@@ -213,7 +213,7 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
             _step_passivity_control(n, newest[0], newest[1], numbers, bodies[0, 0], seen, sent, ends, force)
         energy[n] = ends[0, STORED_ENERGY] + ends[1, STORED_ENERGY]
         for side in range(2):
-            _integrate(bodies[side], state[side], force[side], period, steps)
+            _integrate_side(bodies[side], state[side], force[side], period, steps)
         block = n * _BLOCKS // count
         speed = abs(state[0, 1]) + abs(state[1, 1])
         largest[block] = max(largest[block], speed)
@@ -228,7 +228,7 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
 
 
 @compiled
-def _measure(body, state, force, period, seen):
+def _sample_side_signals(body, state, force, period, seen):
     """Update the seven signals `seen` of a side from its state, just before its force changes."""
     x, v = state[0], state[1]
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
@@ -266,15 +266,15 @@ def _step_waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force
     period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
     total, budget = _read_packet(sent[1], newest_back, n - 1)
     pushed, wave = step_wave_master(seen[0, V], total, budget, b, period, ends[0])
-    _send(sent[0], n, wave, period)
+    _write_wave_packet(sent[0], n, wave, period)
     total, budget = _read_packet(sent[0], newest_forward, n)
     pull, wave = step_wave_slave(seen[1, V], total, budget, stiffness, damping, b, period, ends[1])
-    _send(sent[1], n, wave, period)
+    _write_wave_packet(sent[1], n, wave, period)
     force[0], force[1] = -pushed, pull
 
 
 @compiled
-def _send(sent, n, wave, period):
+def _write_wave_packet(sent, n, wave, period):
     before, energy = 0.0, 0.0
     if n > 0:
         before, energy = sent[n - 1, PACKET_SIGNAL], sent[n - 1, PACKET_ENERGY]
@@ -298,7 +298,7 @@ def _step_passivity_control(n, newest_forward, newest_back, numbers, mass, seen,
 
 
 @compiled
-def _integrate(body, state, force, period, steps):
+def _integrate_side(body, state, force, period, steps):
     """Integrate the motion of a side over one period with a constant force, by Runge-Kutta steps.
 
     `body` is mass, damping and stiffness of the side and of the hand or task; `state` is position and

@@ -17,11 +17,11 @@ import numpy as np
 from hydrotele.control.resolved_motion import (
     COORDINATES,
     arm_specification,
-    follow_pose,
-    follow_rate,
+    step_references_by_rate,
+    step_references_to_pose,
 )
 from hydrotele.core.compiled import compiled
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.teleoperation import CoordinateMapping, TeleopPilot
 from hydrotele.teleop.axis_table import (
@@ -36,8 +36,8 @@ from hydrotele.teleop.axis_table import (
     MAX_REFLECTED_FORCE,
     REFLECTION_RATIO,
     SIGN,
-    flatten_state,
-    make_flat_state,
+    copy_to_contiguous_state,
+    make_contiguous_state,
     split_array,
 )
 from hydrotele.teleop.master import (
@@ -129,7 +129,7 @@ class SlaveState(NamedTuple):
 
 
 @compiled
-def unpack_slave(flat, k):
+def unpack_slave_parameters(flat, k):
     """Return the fields of SlaveParameters as views of a flat array.
 
     Args:
@@ -209,7 +209,7 @@ def build_slave(
     """
     arm, _, ranges = arm_specification(machine)
     k, pose = len(joints), np.zeros(5)
-    task_forward(arm, joints, pose)
+    compute_tip_pose(arm, joints, pose)
     table = np.zeros((k, TABLE_COLUMNS))
     table[:, 0] = -1.0
     for axis, row in enumerate(numbers.axis):
@@ -224,20 +224,20 @@ def build_slave(
             )  # fmt: skip
     safety = pilot.safety
     limits = np.array([safety.packet_timeout, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead])
-    state = make_flat_state(SlaveState, [
+    state = make_contiguous_state(SlaveState, [
         (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT_SIGNAL + 2),
     ])  # fmt: skip
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     kind = np.append(numbers.kind, float(pilot.resolved_motion == "inverse_jacobian"))
-    return flatten_state(SlaveParameters(arm, ranges, pose, table, limits, kind)), state
+    return copy_to_contiguous_state(SlaveParameters(arm, ranges, pose, table, limits, kind)), state
 
 
 @compiled
-def measure_tip(numbers, joint, fresh, elapsed, s):
+def measure_tip(parameters, joint, fresh, elapsed, s):
     """Compute pose and filtered rate of the tip from measured joint angles.
 
     Args:
-        numbers: SlaveParameters.
+        parameters: SlaveParameters.
         joint: (k,) measured joint angles [rad].
         fresh: whether there is a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
@@ -251,7 +251,7 @@ def measure_tip(numbers, joint, fresh, elapsed, s):
     if not fresh:
         return
     pose = np.empty(5)
-    task_forward(numbers.arm, joint, pose)
+    compute_tip_pose(parameters.arm, joint, pose)
     for i in range(5):
         if not np.isfinite(pose[i]):
             return
@@ -263,14 +263,14 @@ def measure_tip(numbers, joint, fresh, elapsed, s):
 
 
 @compiled
-def update_references(numbers, packet, arrived, force, joint, period, s):
+def update_joint_references(parameters, packet, arrived, force, joint, period, s):
     """Compute the joint references of this control period from the master's packet.
 
     The handle commands rates of the task coordinates, which are limited in speed and acceleration and
     resolved to the joints. Without packets the rates go to zero.
 
     Args:
-        numbers: SlaveParameters.
+        parameters: SlaveParameters.
         packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
         arrived: whether a packet arrived in this period, scalar.
         force: (k,) force of the environment on the tip, task coordinates [N], [N m].
@@ -291,19 +291,19 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
         s.flags[PACKET_AGE] = 0.0
     else:
         s.flags[PACKET_AGE] += period
-    s.flags[NO_PACKETS] = 1.0 if s.flags[PACKET_AGE] > numbers.limits[MAX_SILENCE] else 0.0
+    s.flags[NO_PACKETS] = 1.0 if s.flags[PACKET_AGE] > parameters.limits[MAX_SILENCE] else 0.0
     wanted, rate = np.zeros(5), np.zeros(5)
     for c in range(5):
         wanted[c] = s.pose[c]
         if c >= k or (c == 3 and k < 4):
             continue
-        row = numbers.table[c]
+        row = parameters.table[c]
         goal = 0.0
         if row[AXIS] >= 0.0 and s.flags[NO_PACKETS] == 0.0:
             i = int(row[AXIS])
             x, v, hand = s.command[0, i], s.command[1, i], s.command[2, i]
             goal = _commanded_rate(
-                numbers,
+                parameters,
                 row,
                 c,
                 row[AXIS_SIGN] * x,
@@ -314,19 +314,19 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
                 s,
             )
         else:
-            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+            s.asked[c], s.force_integral[c] = s.pose[c] - parameters.start[c], 0.0
         goal = min(row[MAX_SPEED], max(-row[MAX_SPEED], goal))
-        change = numbers.limits[ACCELERATION] * period
+        change = parameters.limits[ACCELERATION] * period
         rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
         wanted[c] += period * rate[c]
     before = s.joint_rate.copy()
-    arm, ranges = numbers.arm, numbers.ranges
-    if numbers.kind[USES_JACOBIAN] > 0.0:
-        held = follow_rate(arm, ranges, joint, rate, period, s.pose, s.joint, s.joint_rate)
+    arm, ranges = parameters.arm, parameters.ranges
+    if parameters.kind[USES_JACOBIAN] > 0.0:
+        held = step_references_by_rate(arm, ranges, joint, rate, period, s.pose, s.joint, s.joint_rate)
     else:
         blocked = s.flags[HELD_AT_EDGE] > 0.0
-        held = follow_pose(arm, ranges, wanted, rate, blocked, s.pose, s.joint, s.joint_rate)
-    lead = numbers.limits[LEAD]
+        held = step_references_to_pose(arm, ranges, wanted, rate, blocked, s.pose, s.joint, s.joint_rate)
+    lead = parameters.limits[LEAD]
     for i in range(k):
         share = min(1.0, period / LEAD_AVERAGING_TIME)
         change = (s.joint_rate[i] - before[i]) / period
@@ -336,7 +336,7 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
     for c in range(5):
         s.rate[c] = 0.0 if held else rate[c]
         if held:
-            s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
+            s.asked[c], s.force_integral[c] = s.pose[c] - parameters.start[c], 0.0
 
 
 @compiled
@@ -428,11 +428,11 @@ def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
 
 
 @compiled
-def check_following_error(numbers, joint, s):
+def check_following_error(parameters, joint, s):
     """Close the valves permanently if a joint is too far from its reference.
 
     Args:
-        numbers: SlaveParameters.
+        parameters: SlaveParameters.
         joint: (k,) measured joint angles [rad]; a value that is not finite also closes the valves.
         s: SlaveState; `flags` is written.
 
@@ -442,19 +442,19 @@ def check_following_error(numbers, joint, s):
     Source: following-error monitor, common in servo drives.
     """
     for i in range(len(joint)):
-        if not abs(joint[i] - s.joint[i]) <= numbers.limits[MAX_FOLLOWING_ERROR]:
+        if not abs(joint[i] - s.joint[i]) <= parameters.limits[MAX_FOLLOWING_ERROR]:
             s.flags[VALVES_CLOSED] = 1.0
 
 
 @compiled
-def write_machine_packet(numbers, force, s, packet):
+def write_machine_packet(parameters, force, s, packet):
     """Write the packet from the machine to the master: tip force, positions and speeds.
 
     Positions are relative to the start. A passive channel replaces the reference by signal and energy
     of the channel; with four channels the reference replaces the measured motion.
 
     Args:
-        numbers: SlaveParameters.
+        parameters: SlaveParameters.
         force: (k,) tip force in task coordinates [N], [N m].
         s: SlaveState.
         packet: (8, k) written, except for the last three rows, the task impedance.
@@ -466,17 +466,17 @@ def write_machine_packet(numbers, force, s, packet):
     """
     for c in range(len(force)):
         packet[TIP_FORCE, c] = force[c]
-        packet[TIP_POSITION, c] = s.measured[0, c] - numbers.start[c]
+        packet[TIP_POSITION, c] = s.measured[0, c] - parameters.start[c]
         packet[TIP_SPEED, c] = s.measured[1, c]
-        packet[REFERENCE_POSITION, c] = s.pose[c] - numbers.start[c]
+        packet[REFERENCE_POSITION, c] = s.pose[c] - parameters.start[c]
         packet[REFERENCE_SPEED, c] = s.rate[c]
-    if numbers.kind[0] == WAVE_VARIABLES or numbers.kind[0] == PASSIVITY_CONTROL:
+    if parameters.kind[0] == WAVE_VARIABLES or parameters.kind[0] == PASSIVITY_CONTROL:
         for c in range(len(force)):
             packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c] = (
                 s.line[c, SENT_SIGNAL],
                 s.line[c, SENT_SIGNAL + 1],
             )
-    if numbers.kind[0] == FOUR_CHANNEL:
+    if parameters.kind[0] == FOUR_CHANNEL:
         for c in range(len(force)):
             packet[TIP_POSITION, c], packet[TIP_SPEED, c] = (
                 packet[REFERENCE_POSITION, c],
@@ -485,11 +485,11 @@ def write_machine_packet(numbers, force, s, packet):
 
 
 @compiled
-def step_slave(numbers, packet, arrived, force, joint, period, s):
+def step_slave(parameters, packet, arrived, force, joint, period, s):
     """Run one control period of the slave side: joint references and following-error check.
 
     Args:
-        numbers: SlaveParameters.
+        parameters: SlaveParameters.
         packet: (3, 6) displacement of the handle [m], [rad], its rate, and the hand's force [N], [N m].
         arrived: whether a packet arrived in this period, scalar.
         force: (k,) force of the environment on the tip, task coordinates [N], [N m].
@@ -500,7 +500,7 @@ def step_slave(numbers, packet, arrived, force, joint, period, s):
     Returns:
         Nothing.
 
-    Source: `update_references` and `check_following_error` in turn.
+    Source: `update_joint_references` and `check_following_error` in turn.
     """
-    update_references(numbers, packet, arrived, force, joint, period, s)
-    check_following_error(numbers, joint, s)
+    update_joint_references(parameters, packet, arrived, force, joint, period, s)
+    check_following_error(parameters, joint, s)

@@ -17,20 +17,20 @@ import numpy as np
 from hydrotele.control.endpoint_force import EndpointForce
 from hydrotele.control.plan import Plan
 from hydrotele.control.resolved_motion import COORDINATES, arm_specification
-from hydrotele.control.servo import DriveReferences, tabulate_drives
+from hydrotele.control.servo import DriveReferences, tabulate_drive_geometry
 from hydrotele.control.task_impedance import TaskImpedance
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.joystick import AXES, load_joystick
-from hydrotele.machine.machine import Machine, SensorSet, get_sensors
+from hydrotele.machine.machine import Machine, SensorSet, get_sensor_set
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Channel, SensorFault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.simulate.layout import field_offsets
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import contact_record, sum_contact_forces, surrounding_geoms
+from hydrotele.simulate.record import contact_record, mark_surrounding_geoms, sum_contact_forces
 from hydrotele.teleop.axis_table import DEADBAND, HANDLE_RANGE, flat_view
 from hydrotele.teleop.master import (
     TASK_DAMPING,
@@ -39,7 +39,7 @@ from hydrotele.teleop.master import (
     MasterParameters,
     MasterState,
     build_master,
-    tip_over_wrench,
+    compute_tip_over_protection,
 )
 from hydrotele.teleop.operator_model import HandInput, OperatorModel
 from hydrotele.teleop.operator_parameters import attach_operator_hand
@@ -50,7 +50,7 @@ from hydrotele.teleop.round_trip import (
     ChannelBuffers,
     compute_arriving_ages,
     delays_to_periods,
-    load_delays,
+    load_packet_delays,
 )
 from hydrotele.teleop.slave import (
     HELD_AT_EDGE,
@@ -134,23 +134,23 @@ class TeleoperationLog:
         units: dict[str, str] = {}
         pick = slice(0, rows * every, every)
 
-        def put(name: str, column: np.ndarray, unit: str) -> None:
+        def add_channel(name: str, column: np.ndarray, unit: str) -> None:
             values[name], units[name] = column[pick].copy(), unit
 
         handle, hand, push = self.master("handle"), self.master("hand"), self.master("push")
         stiffness, current = self.master("stiffness"), self.master("currents")
         for i, axis in enumerate(AXES):
-            put(f"handle.{axis}", handle[:, i], _DISPLACEMENT_UNITS[i])
-            put(f"hand_force.{axis}", hand[:, i], _FORCES[i])
-            put(f"handle_force.{axis}", push[:, i], _FORCES[i])
-            put(f"handle_stiffness.{axis}", stiffness[:, i], _STIFFNESS[i])
-            put(f"coil_current.coil_{i + 1}", current[:, i], "A")
+            add_channel(f"handle.{axis}", handle[:, i], _DISPLACEMENT_UNITS[i])
+            add_channel(f"hand_force.{axis}", hand[:, i], _FORCES[i])
+            add_channel(f"handle_force.{axis}", push[:, i], _FORCES[i])
+            add_channel(f"handle_stiffness.{axis}", stiffness[:, i], _STIFFNESS[i])
+            add_channel(f"coil_current.coil_{i + 1}", current[:, i], "A")
         pose, seen = self.slave("pose"), self.slave("measured")
         for i, name in enumerate(self.coordinates):
             place, force = _TASK_UNITS[name]
-            put(f"tip_force.{name}", self.force[:, i], force)
-            put(f"tip_reference.{name}", pose[:, i], place)
-            put(f"tip_pose.{name}", seen[:, 0, i], place)
+            add_channel(f"tip_force.{name}", self.force[:, i], force)
+            add_channel(f"tip_reference.{name}", pose[:, i], place)
+            add_channel(f"tip_pose.{name}", seen[:, 0, i], place)
         return values, units
 
 
@@ -210,7 +210,7 @@ class TeleoperationSystem:
         self._line = _make_channel_buffers(pilot, scenario, len(axes))
         self._flotor = SimulatedFlotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
-        self._sensors = get_sensors(machine, scenario.sensors)
+        self._sensors = get_sensor_set(machine, scenario.sensors)
         self._force_estimator = _make_force_estimator(machine, plan.axes, pilot, feedback, self._period, self._sensors)
         self._task_estimator, self._pose = (
             _make_task_estimator(pilot, feedback, self._period, len(axes)),
@@ -220,7 +220,7 @@ class TeleoperationSystem:
         self._force = (
             self._force_estimator.force if self._force_estimator and not self._uses_true_force else np.zeros(len(axes))
         )
-        self._owners = plant.model, surrounding_geoms(plant)  # keep the memory of addresses alive
+        self._owners = plant.model, mark_surrounding_geoms(plant)  # keep the memory of addresses alive
         self._contacts = contact_record(plant.model, data, self._owners[1])
         self.log = TeleoperationLog(scenario.tick_count, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
@@ -241,7 +241,7 @@ class TeleoperationSystem:
     def _collect_arrays(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
         """Return name -> array whose memory address the compiled loop (`step_teleoperation`) uses."""
         plan, data, line = self._plan, self._data, self._line
-        grid, table = tabulate_drives(machine, plan.axes)
+        grid, table = tabulate_drive_geometry(machine, plan.axes)
         assert plan.pose is not None
         return {
             "joint": self._feedback.joint, "force": self._force, "columns": self.columns,
@@ -323,7 +323,7 @@ class TeleoperationSystem:
         if fresh or self._uses_true_force:
             self._update_forces(fresh)
         if pilot.tip_over:
-            tip_over_wrench(
+            compute_tip_over_protection(
                 pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
@@ -331,9 +331,9 @@ class TeleoperationSystem:
             share = float(self._line.state[PACKET_GAIN])
             self._exchange(self._qpos, self._line.packet, share, self._m.extra)
         elif self._flotor.has_edge_loss:
-            self._flotor.weaken_coils()
+            self._flotor.update_coil_force_constants()
         if tick % operator.ticks_per_decision == 0:
-            operator.decide(tick)
+            operator.decide_handle_reference(tick)
 
     def next_prepared_tick(self, tick: int) -> int:
         """Return the next control tick after `tick` that needs `prepare_tick`."""
@@ -342,18 +342,18 @@ class TeleoperationSystem:
         every = math.gcd(self.operator.ticks_per_decision, self._feedback.ticks_per_sample)
         return tick - tick % every + every
 
-    def check_safety(self, tick: int) -> bool:
+    def run_safety_checks(self, tick: int) -> bool:
         """Run the safety checks before the machine moves; return whether to close the valves.
 
         Args:
             tick: control tick for which `step_teleoperation` returned true, or a multiple of
                 `TICKS_PER_CHECK`.
         """
-        self._update_trip(tick)
+        self._close_valves_on_fault(tick)
         return self.valves_closed
 
     @property
-    def records(self) -> tuple[np.ndarray, np.ndarray]:
+    def memory_records(self) -> tuple[np.ndarray, np.ndarray]:
         """Memory records of this loop and of the simulated joystick for `step_teleoperation`."""
         return self._record, self._flotor.record
 
@@ -368,7 +368,7 @@ class TeleoperationSystem:
         if self._uses_true_force:
             self._update_true_force()
         if self._task_estimator and fresh:
-            task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
+            compute_tip_pose(self._slave.arm, seen.joint[self.columns], self._pose)
             self._task_estimator.update(self._force, self._pose[: len(self._force)])
             self._line.back[:, TASK_STIFFNESS] = self._task_estimator.stiffness
             self._line.back[:, TASK_DAMPING] = self._task_estimator.damping
@@ -389,7 +389,7 @@ class TeleoperationSystem:
             "tripped": self.valves_closed,
         }
 
-    def _update_trip(self, tick: int) -> None:
+    def _close_valves_on_fault(self, tick: int) -> None:
         """Request closed valves if a joint lags its reference or a sensor is constant.
 
         The reason, missing packets and the workspace edge are added to `notes`, each once.
@@ -531,7 +531,7 @@ def _packet_delays(scenario: Scenario, channel: Channel, period: float) -> np.nd
     ticks = scenario.tick_count
     if channel.trace:
         path = Path(scenario.folder, channel.trace)
-        measured = np.stack(load_delays(path), axis=1)
+        measured = np.stack(load_packet_delays(path), axis=1)
         found = delays_to_periods(measured, period)
         if np.any(found.max(axis=0) < 0):
             raise InputError(path, "all packets of one direction are lost; steering is impossible")

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.two_port import Impedance, stiffness_margin
+from hydrotele.teleop.two_port import Impedance, stability_theorem_margin
 
 _STEP_RATIO = 0.01  # integration steps per time constant of the fastest mode
 _MIN_MOTION_RATIO = 1e-9  # minimum speed or displacement, relative to the start of a half swing
@@ -58,13 +58,13 @@ class StiffnessAxis:
         )  # fmt: skip
 
     @property
-    def theorem_margin(self) -> float:
+    def stability_theorem_margin(self) -> float:
         """Margin `B^2 - 4 M K_max` of the stability theorem of stiffness feedback [(N s/m)^2].
 
         The axis is stable with every change of the stiffness if the margin and K_min are positive; the
         condition is sufficient, not necessary (Zhu 1994, 4.14).
         """
-        return stiffness_margin(self.mass, self.damping, self.max_stiffness)
+        return stability_theorem_margin(self.mass, self.damping, self.max_stiffness)
 
     @property
     def stability_criterion(self) -> str:
@@ -74,7 +74,7 @@ class StiffnessAxis:
         requires that the motion under the worst switching decays, which is necessary and
         sufficient.
         """
-        if self.min_stiffness > 0.0 and self.damping > 0.0 and self.theorem_margin > 0.0:
+        if self.min_stiffness > 0.0 and self.damping > 0.0 and self.stability_theorem_margin > 0.0:
             return "theorem"
         return "switching bound" if self.min_stiffness > 0.0 and self.half_swing_growth < 1.0 else "nothing"
 
@@ -89,11 +89,11 @@ class StiffnessAxis:
         if self.min_stiffness == self.max_stiffness:
             return 0.0
 
-        def growth(damping: float) -> float:
+        def growth_minus_one(damping: float) -> float:
             return worst_switching_growth(self.mass, damping, self.min_stiffness, self.max_stiffness) - 1.0
 
-        most = self.theorem_damping
-        found: float = brentq(growth, 0.0, most, xtol=1e-3 * most)  # pyright: ignore - not full
+        most = self.stability_theorem_damping
+        found: float = brentq(growth_minus_one, 0.0, most, xtol=1e-3 * most)  # pyright: ignore - not full
         return found
 
     @property
@@ -102,12 +102,12 @@ class StiffnessAxis:
         return worst_switching_growth(self.mass, self.damping, self.min_stiffness, self.max_stiffness)
 
     @property
-    def theorem_damping(self) -> float:
+    def stability_theorem_damping(self) -> float:
         """Damping above which the stability theorem holds, `2 sqrt(M K_max)` [N s/m]."""
         return 2.0 * math.sqrt(self.mass * self.max_stiffness)
 
 
-def worst_switching_growth(mass: float, damping: float, least: float, most: float) -> float:
+def worst_switching_growth(mass: float, damping: float, min_stiffness: float, max_stiffness: float) -> float:
     """Return the growth of a spring's speed over half a swing, under the worst stiffness switching.
 
     The stiffness is lowest while the mass moves outwards, and highest while it returns. The motion is
@@ -117,8 +117,8 @@ def worst_switching_growth(mass: float, damping: float, least: float, most: floa
     Args:
         mass: mass of the axis [kg].
         damping: damping of the axis [N s/m].
-        least: stiffness outwards, the lower bound K_min [N/m].
-        most: stiffness inwards, the upper bound K_max [N/m].
+        min_stiffness: stiffness outwards, the lower bound K_min [N/m].
+        max_stiffness: stiffness inwards, the upper bound K_max [N/m].
 
     Returns:
         Speed through the centre relative to that half a swing earlier [1]; 0 if it does not return
@@ -131,13 +131,13 @@ def worst_switching_growth(mass: float, damping: float, least: float, most: floa
     >>> worst_switching_growth(1.0, 41.0, 20.0, 400.0)
     0.0
     """
-    if least == 0.0 and damping == 0.0:
+    if min_stiffness == 0.0 and damping == 0.0:
         return math.inf
-    rate = max(damping / mass, math.sqrt(most / mass))
-    return float(_simulate_half_swing(damping / mass, least / mass, most / mass, _STEP_RATIO / rate))
+    rate = max(damping / mass, math.sqrt(max_stiffness / mass))
+    return float(_simulate_half_swing(damping / mass, min_stiffness / mass, max_stiffness / mass, _STEP_RATIO / rate))
 
 
-def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
+def compute_switching_growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
     """Compute the speed growth under the worst switching on a grid of damping and upper stiffness.
 
     Args:

@@ -142,7 +142,7 @@ def make_two_port(
     def zero_block(s: np.ndarray) -> np.ndarray:
         return np.zeros_like(s)
 
-    def rate_block(block: Block) -> Block:
+    def multiply_by_rate_gain(block: Block) -> Block:
         return lambda s: block(s) * k / s
 
     forward = _scale_block(slave_control, gains.position)
@@ -157,11 +157,11 @@ def make_two_port(
         back, ahead = np.ones_like, np.ones_like
         feel = lambda s: -(master(s) + master_control(s))  # noqa: E731
     if structure in ("rate_position", "rate_force"):
-        forward = rate_block(slave_control)
+        forward = multiply_by_rate_gain(slave_control)
     if structure in ("rate_position", "four_channel_rate"):
-        own = rate_block(master_control)
+        own = multiply_by_rate_gain(master_control)
     if structure == "four_channel_rate":
-        forward = rate_block(lambda s: slave(s) * jerk + slave_control(s))
+        forward = multiply_by_rate_gain(lambda s: slave(s) * jerk + slave_control(s))
         back, ahead = (lambda s: s / k), (lambda s: k / s)
         feel = lambda s: -(master(s) * s / k * jerk + master_control(s))  # noqa: E731
     return TwoPort(master, slave, own, slave_control, forward, back, ahead, feel, delay_forward, delay_back)
@@ -257,7 +257,7 @@ def characteristic_function(port: TwoPort, s: np.ndarray | complex, hand: Block,
     return near * far + (c2 * environment(s) + c4) * (c1 - c3 * hand(s))
 
 
-def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
+def stability_theorem_margin(mass: float, damping: float, stiffest: float) -> float:
     """Return the margin of the stability theorem of stiffness feedback, `B^2 - 4 M K_max`.
 
     `M x'' + B x' + K(t) x = 0` with a stiffness between `K_min > 0` and K_max is uniformly
@@ -274,7 +274,7 @@ def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
 
     Source: Zhu 1994, theorem 4-2, 4.11-4.14.
 
-    >>> stiffness_margin(1.0, 30.0, 200.0)
+    >>> stability_theorem_margin(1.0, 30.0, 200.0)
     100.0
     """
     return damping**2 - 4.0 * mass * stiffest

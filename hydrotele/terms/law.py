@@ -284,7 +284,7 @@ _NO_FUNCTION, _NO_VARIABLE, _MAX_POWER = 0, -1, 6
 _MAX_PRODUCT_LENGTH = 1000  # characters of a product; Python's parser needs stack memory in proportion
 
 
-def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]:
+def encode_formula(parameters: Mapping[str, float]) -> dict[str, list[float]]:
     """Encode a formula as numbers for the law `formula`.
 
     Args:
@@ -299,7 +299,7 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
     Raises:
         ValueError: a product cannot be parsed; the message describes the syntax.
 
-    >>> formula_arguments({"velocity ** 2": 3.0})["numbers"]
+    >>> encode_formula({"velocity ** 2": 3.0})["numbers"]
     [1, 3.0, 1, 0, 2, -1, 0.0, 0.0, 2]
     """
     if not parameters:
@@ -322,14 +322,14 @@ def _parse_product(text: str) -> list[list[float]]:
     """
     text = text.strip()
     if len(text) > _MAX_PRODUCT_LENGTH:
-        raise _formula_error(text, f"it has {len(text)} characters, at most {_MAX_PRODUCT_LENGTH}")
+        raise _make_formula_error(text, f"it has {len(text)} characters, at most {_MAX_PRODUCT_LENGTH}")
     try:
         node = ast.parse(text, mode="eval").body
     except (SyntaxError, ValueError):  # ValueError: a null character
-        raise _formula_error(text, "it cannot be parsed") from None
+        raise _make_formula_error(text, "it cannot be parsed") from None
     except (RecursionError, MemoryError):  # raised by Python's parser
-        raise _formula_error(text, "it is nested too deeply") from None
-    if _number_of(node) == 1.0:
+        raise _make_formula_error(text, "it is nested too deeply") from None
+    if _constant_value(node) == 1.0:
         return []
     return [_parse_factor(text, part) for part in _split_factors(node)]
 
@@ -350,21 +350,21 @@ def _parse_factor(text: str, node: ast.expr) -> list[float]:
     """Encode a factor as function code, two variable indices, two constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
-        exponent = _number_of(node.right)
+        exponent = _constant_value(node.right)
         if exponent not in range(1, _MAX_POWER + 1):
-            raise _formula_error(text, f"a power must be a whole number from 1 to {_MAX_POWER}")
+            raise _make_formula_error(text, f"a power must be a whole number from 1 to {_MAX_POWER}")
         node, power = node.left, int(exponent)
     if not isinstance(node, ast.Call):
         return [_NO_FUNCTION, *_parse_argument(text, node), 0.0, 0.0, power]
     name = node.func.id if isinstance(node.func, ast.Name) else "?"
     if name not in FUNCTIONS:
-        raise _formula_error(text, f"{name!r} is not a function; {suggest_valid_name(name, FUNCTIONS)}")
+        raise _make_formula_error(text, f"{name!r} is not a function; {suggest_valid_name(name, FUNCTIONS)}")
     code, count, words = FUNCTIONS[name]
     if len(node.args) != 1 + count or node.keywords:
-        raise _formula_error(text, f"the function is {words}")
+        raise _make_formula_error(text, f"the function is {words}")
     constants = [_parse_number(text, argument) for argument in node.args[1:]]
     if name in _DIVISOR_CONSTANTS and constants[_DIVISOR_CONSTANTS[name]] <= 0.0:
-        raise _formula_error(text, f"a width, length or time must be positive: {words}")
+        raise _make_formula_error(text, f"a width, length or time must be positive: {words}")
     constants += [0.0] * (2 - count)
     return [code, *_parse_argument(text, node.args[0]), *constants, power]
 
@@ -380,20 +380,20 @@ def _parse_variable(text: str, node: ast.expr) -> int:
     """Return the index in `DriveState` of the variable that a syntax node names."""
     name = node.id if isinstance(node, ast.Name) else ast.get_source_segment(text, node) or text
     if name not in VARIABLES:
-        raise _formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
+        raise _make_formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
     return VARIABLES[name]
 
 
 def _parse_number(text: str, node: ast.expr) -> float:
     """Return the value of a numeric constant; raise ValueError for another or too large value."""
-    value = _number_of(node)
+    value = _constant_value(node)
     if not abs(value) <= MAX_MAGNITUDE:
         segment = ast.get_source_segment(text, node) or text
-        raise _formula_error(text, f"{segment!r} is not a number from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
+        raise _make_formula_error(text, f"{segment!r} is not a number from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
     return float(value)
 
 
-def _number_of(node: ast.expr) -> float:
+def _constant_value(node: ast.expr) -> float:
     """Return the value of a syntax node that is a number, with or without a sign; otherwise NaN."""
     sign = 1
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
@@ -403,7 +403,7 @@ def _number_of(node: ast.expr) -> float:
     return math.nan
 
 
-def _formula_error(text: str, why: str) -> ValueError:
+def _make_formula_error(text: str, why: str) -> ValueError:
     """Create (not raise) the error for a formula that cannot be parsed, with the reason `why`."""
     return ValueError(
         f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
@@ -451,7 +451,7 @@ def exponential_drift(s: DriveState, value: float, time_constant: float) -> floa
     return value * (1.0 - math.exp(-s.time / time_constant))
 
 
-def _check_points(given: Parameters, *names: str) -> None:
+def _check_increasing_points(given: Parameters, *names: str) -> None:
     """Raise ValueError unless each named parameter is a list of at least two increasing numbers."""
     for name in names:
         points = list(given[name])
@@ -464,13 +464,13 @@ def _flatten(values: Any) -> list[float]:
 
 
 def _check_table(given: Parameters) -> None:
-    _check_points(given, "points")
+    _check_increasing_points(given, "points")
     if len(given["values"]) != len(given["points"]):
         raise ValueError(f"values must have as many numbers as points, {len(given['points'])}")
 
 
 def _check_bilinear_table(given: Parameters) -> None:
-    _check_points(given, "row_points", "column_points")
+    _check_increasing_points(given, "row_points", "column_points")
     rows, columns = len(given["row_points"]), len(given["column_points"])
     if len(_flatten(given["values"])) != rows * columns:
         raise ValueError(f"values must be {rows} rows of {columns} numbers")
@@ -537,15 +537,15 @@ def bilinear_table(
     return low + a * (high - low)
 
 
-@law(translate=formula_arguments)
+@law(translate=encode_formula)
 def formula(s: DriveState, numbers: Numbers) -> float:
     """Evaluate a formula: a sum of products of basic functions, each with a coefficient.
 
-    `numbers` is the encoding of `formula_arguments`; the module docstring gives the syntax.
+    `numbers` is the encoding of `encode_formula`; the module docstring gives the syntax.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(velocity=-2.0)
-    >>> coded = formula_arguments({"1": 5.0, "velocity * abs(velocity)": 3.0})
+    >>> coded = encode_formula({"1": 5.0, "velocity * abs(velocity)": 3.0})
     >>> float(formula(state, np.array(coded["numbers"])))
     -7.0
     """

@@ -19,7 +19,7 @@ from numba import carray, cfunc, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.terms.law import BALANCES, LAWS, VARIABLES, DriveState, Law, Numbers, Term, Variable
 
@@ -130,8 +130,8 @@ def _compile_uncached(function):
     return njit(error_model="numpy", nogil=True)(function)
 
 
-def terms_table(
-    terms: Sequence[Term], order: Sequence[str], memory: int = 0,
+def encode_terms_table(
+    terms: Sequence[Term], order: Sequence[str], first_state_index: int = 0,
     areas: Mapping[str, Sequence[float]] | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Encode a machine's terms as one array, which the compiled functions of this module read.
@@ -139,7 +139,7 @@ def terms_table(
     Args:
         terms: terms of a machine.
         order: axis names in actuator order.
-        memory: index, in MuJoCo's activation vector, of the internal state of the first term with
+        first_state_index: index, in MuJoCo's activation vector, of the internal state of the first term with
             hysteresis; those of further terms follow. 0 if there are no such activations: all
             internal states then count as 0.
         areas: hydraulic axis -> (2,) areas on which its head- and rod-side pressures act [m^2] or
@@ -155,7 +155,9 @@ def terms_table(
     if not terms:
         return NO_TERMS
     rows, back, first = [], [], _HEADER_SIZE + _ROW_SIZE * len(terms)
-    places = {id(term): memory + k for k, term in enumerate(terms_with_hysteresis(terms)) if memory}
+    places = {
+        id(term): first_state_index + k for k, term in enumerate(terms_with_hysteresis(terms)) if first_state_index
+    }
     for term in terms:
         place = law_index(term.law)
         numbers = LAWS[term.law].encode_parameters(term.parameters)
@@ -237,8 +239,8 @@ def _call_law(typingctx, function, terms, at, state):
     return types.float64(function, terms, at, state), codegen
 
 
-@allocation_free
-def _law_variable(terms, at, k, value, s, drives):
+@compile_without_allocation
+def _get_law_input(terms, at, k, value, s, drives):
     """Return the value of state variable k that the law of a term receives.
 
     It is that of another drive if the term's `variables_from` names one, otherwise `value`. It is
@@ -255,14 +257,14 @@ def _law_variable(terms, at, k, value, s, drives):
     return value
 
 
-@allocation_free
+@compile_without_allocation
 def _hysteresis_state(terms, at, drives):
     """Return the internal state of a term's hysteresis, scalar [1]; 0 if no activation holds it."""
     place = int(terms[at + _STATE_INDEX])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
 
-@allocation_free
+@compile_without_allocation
 def _hysteresis_variable(terms, at, s, drives):
     """Return the present value of the state variable that drives a term's hysteresis [its unit]."""
     k = int(terms[at + _HYSTERESIS_VARIABLE])
@@ -273,14 +275,14 @@ def _hysteresis_variable(terms, at, s, drives):
     return s[k]
 
 
-@allocation_free
-def update_hysteresis(kind, state, x):
+@compile_without_allocation
+def update_hysteresis(kind, state, scaled_variable):
     """Update a backlash operator or a relay with hysteresis for a new value of its variable.
 
     Args:
         kind: PLAY (backlash operator) or SWITCH (relay).
         state: previous internal state, scalar [1].
-        x: for a play the variable divided by the half width; for a switch the variable scaled to
+        scaled_variable: for a play the variable divided by the half width; for a switch the variable scaled to
             0 at the off threshold and 1 at the on threshold, scalar [1].
 
     Returns:
@@ -291,18 +293,18 @@ def update_hysteresis(kind, state, x):
         relay's jumps are ramps.
     """
     if kind == PLAY:
-        return min(x + 1.0, max(x - 1.0, state))
-    low = min(1.0, max(0.0, (x - 1.0) / _SWITCH_RAMP_FRACTION + 0.5))
-    high = min(1.0, max(0.0, x / _SWITCH_RAMP_FRACTION + 0.5))
+        return min(scaled_variable + 1.0, max(scaled_variable - 1.0, state))
+    low = min(1.0, max(0.0, (scaled_variable - 1.0) / _SWITCH_RAMP_FRACTION + 0.5))
+    high = min(1.0, max(0.0, scaled_variable / _SWITCH_RAMP_FRACTION + 0.5))
     return min(high, max(low, state))
 
 
-@allocation_free
+@compile_without_allocation
 def update_term_state(terms, term, value, state):
     """Update the hysteresis state of a term for a new value of its variable.
 
     Args:
-        terms: (n,) table of `terms_table`.
+        terms: (n,) table of `encode_terms_table`.
         term: number of a term with hysteresis among all terms of the table.
         value: present value of the variable of its hysteresis, scalar [its unit].
         state: previous internal state, scalar [1].
@@ -318,8 +320,8 @@ def update_term_state(terms, term, value, state):
     return update_hysteresis(terms[at + _HYSTERESIS], state, x)
 
 
-@allocation_free
-def hysteresis_location(terms, term):
+@compile_without_allocation
+def locate_hysteresis_state(terms, term):
     """Return where a term's hysteresis state is stored, and which drive's variable drives it.
 
     Returns:
@@ -335,7 +337,7 @@ def hysteresis_location(terms, term):
     return int(terms[at + _STATE_INDEX]), axis, k
 
 
-@allocation_free
+@compile_without_allocation
 def _other_drive_variable(terms, j, s, drives):
     """Return the variable of another drive that entry j of the table selects.
 
@@ -369,15 +371,15 @@ def window_factor(time, begin, end):
     return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _WINDOW_RAMP))
 
 
-_window_factor = allocation_free(window_factor)
+_window_factor = compile_without_allocation(window_factor)
 
 
-@allocation_free
+@compile_without_allocation
 def has_term(terms, balance, axis):
     """Return whether any term adds to a balance of a drive; otherwise its sum need not be computed.
 
     Args:
-        terms: (n,) table of `terms_table`.
+        terms: (n,) table of `encode_terms_table`.
         balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator, or ANY_DRIVE.
 
@@ -393,12 +395,12 @@ def has_term(terms, balance, axis):
     return False
 
 
-@allocation_free
+@compile_without_allocation
 def sum_terms(terms, balance, axis, s, drives):
     """Return the sum of the laws of all terms that add to a balance of a drive.
 
     Args:
-        terms: (n,) table of `terms_table`.
+        terms: (n,) table of `encode_terms_table`.
         balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator.
         s: DriveState of the drive.
@@ -434,16 +436,16 @@ def sum_terms(terms, balance, axis, s, drives):
             own = _hysteresis_variable(terms, at, s, drives)
         if played or terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
             seen = DriveState(
-                _law_variable(terms, at, np.int64(0), s.time, s, drives),
-                _law_variable(terms, at, np.int64(1), s.position, s, drives),
-                _law_variable(terms, at, np.int64(2), s.velocity, s, drives),
-                _law_variable(terms, at, np.int64(3), s.spool, s, drives),
-                _law_variable(terms, at, np.int64(4), s.spool_rate, s, drives),
-                _law_variable(terms, at, np.int64(5), s.pressure_head, s, drives),
-                _law_variable(terms, at, np.int64(6), s.pressure_rod, s, drives),
-                _law_variable(terms, at, np.int64(7), s.pressure_supply, s, drives),
-                _law_variable(terms, at, np.int64(8), s.command, s, drives),
-                _law_variable(terms, at, np.int64(9), s.force, s, drives),
+                _get_law_input(terms, at, np.int64(0), s.time, s, drives),
+                _get_law_input(terms, at, np.int64(1), s.position, s, drives),
+                _get_law_input(terms, at, np.int64(2), s.velocity, s, drives),
+                _get_law_input(terms, at, np.int64(3), s.spool, s, drives),
+                _get_law_input(terms, at, np.int64(4), s.spool_rate, s, drives),
+                _get_law_input(terms, at, np.int64(5), s.pressure_head, s, drives),
+                _get_law_input(terms, at, np.int64(6), s.pressure_rod, s, drives),
+                _get_law_input(terms, at, np.int64(7), s.pressure_supply, s, drives),
+                _get_law_input(terms, at, np.int64(8), s.command, s, drives),
+                _get_law_input(terms, at, np.int64(9), s.force, s, drives),
                 let_through,
                 own - let_through,
             )
@@ -451,7 +453,7 @@ def sum_terms(terms, balance, axis, s, drives):
     return total
 
 
-@allocation_free
+@compile_without_allocation
 def _shift_state(s, velocity, head, rod):
     """Return a copy of a DriveState with increments added to velocity and chamber pressures.
 
@@ -464,12 +466,12 @@ def _shift_state(s, velocity, head, rod):
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def sum_terms_with_slope(terms, balance, axis, s, drives):
     """Return the sum of the force or command terms of a drive, and its derivative by the velocity.
 
     Args:
-        terms: (n,) table of `terms_table`.
+        terms: (n,) table of `encode_terms_table`.
         balance: FORCE or COMMAND.
         axis: index of the actuator.
         s: DriveState of the drive.
@@ -484,12 +486,12 @@ def sum_terms_with_slope(terms, balance, axis, s, drives):
     return value, (beyond - value) / step
 
 
-@allocation_free
+@compile_without_allocation
 def sum_flow_terms(terms, axis, s, drives):
     """Return the flows that terms add to both chambers of a drive, and their pressure derivatives.
 
     Args:
-        terms: (n,) table of `terms_table`.
+        terms: (n,) table of `encode_terms_table`.
         axis: index of the actuator.
         s: DriveState.
         drives: Drives.

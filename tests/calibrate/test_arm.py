@@ -9,10 +9,10 @@ from hydrotele.calibrate.arm import (
     calibrated_machine,
     identify_arm,
     identify_jointly,
-    machine_with_loop,
+    update_machine_geometry,
 )
 from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link, read_calibration_logs
-from hydrotele.calibrate.arm_poses import add_drift
+from hydrotele.calibrate.arm_poses import add_held_link_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.linkage import (
@@ -21,7 +21,7 @@ from hydrotele.calibrate.linkage import (
     linkage_parameters,
     machine_with_linkage,
 )
-from hydrotele.calibrate.loop import ball_position_and_rates, build_loop, closure_error
+from hydrotele.calibrate.loop import ball_position_and_derivatives, build_loop, closure_error
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.calibrator_readings import (
     find_true_parameters,
@@ -63,7 +63,7 @@ def test_chain_is_table_2():
 def test_derivatives_are_those_of_finite_differences():
     """By every parameter of every link, 1e-6 of a step of 1e-6."""
     theta = TRUE.home[None, 2:] + 0.1
-    place, by = ball_position_and_rates(TRUE, 1, theta)
+    place, by = ball_position_and_derivatives(TRUE, 1, theta)
     for k in range(len(TRUE) - 1):
         for c in range(5):
             values, turned = TRUE.values.copy(), theta.copy()
@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_finite_differences():
             if c == 0:
                 turned[:, k - 1] += 1e-6
             values[1 + k, c] += 1e-6
-            moved, _ = ball_position_and_rates(dataclasses.replace(TRUE, values=values), 1, turned)
+            moved, _ = ball_position_and_derivatives(dataclasses.replace(TRUE, values=values), 1, turned)
             np.testing.assert_allclose((moved - place) / 1e-6, by[:, :, k, c], atol=2e-5)
 
 
@@ -117,7 +117,7 @@ def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
 
 def test_corruption_is_found_and_left_out(clean):
     rng = np.random.default_rng(4)
-    stages = [add_drift(LOOP, simulate_readings(TRUE, one, rng)) for one in clean]
+    stages = [add_held_link_drift(LOOP, simulate_readings(TRUE, one, rng)) for one in clean]
     assert identify_without_bad_data(LOOP, stages).regions == []
     wrong = stages[1].theta.copy()
     wrong[40:70, 1] += np.radians(2.5)
@@ -146,7 +146,7 @@ def test_calibrated_machine_has_the_chain(clean, exact):
     offset = made.sensor_errors["angle.calibrator_yoke"].offset
     assert offset == pytest.approx(LOOP.value("offset.calibrator_yoke")
                                    - TRUE.value("offset.calibrator_yoke"), abs=1e-9)  # fmt: skip
-    same = build_loop(machine_with_loop(MACHINE, LOOP, LOOP))
+    same = build_loop(update_machine_geometry(MACHINE, LOOP, LOOP))
     np.testing.assert_allclose(same.values, LOOP.values, atol=1e-12)
 
 

@@ -10,8 +10,8 @@ from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.flexibility import (
     estimate_flexibility,
-    joint_loads,
     refit_with_flexibility,
+    relative_lever_arms,
 )
 from hydrotele.calibrate.loop import build_loop
 from hydrotele.machine.machine_file import load_machine
@@ -39,7 +39,7 @@ def clean(loop):
 @pytest.fixture(scope="module")
 def loads(loop, clean):
     fit = identify_arm(loop, clean)
-    return [joint_loads(loop, poses, fit) for poses in clean]
+    return [relative_lever_arms(loop, poses, fit) for poses in clean]
 
 
 def simulate(clean, loads, seed, bend):

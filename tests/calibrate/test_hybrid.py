@@ -8,9 +8,9 @@ from hydrotele.calibrate.hybrid import (
     calibrate_best_model,
     calibrate_hybrid_robot,
     find_redundancy,
-    fitted_equations,
     null_directions,
     pose_errors,
+    restrict_to_fitted_parameters,
 )
 from hydrotele.calibrate.posterior import (
     autocorrelation_time,
@@ -20,11 +20,11 @@ from hydrotele.calibrate.posterior import (
     split_rhat,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.wang_identification import measure_rank
+from hydrotele.experiments.wang_identification import count_independent_parameters
 from hydrotele.experiments.wang_robots import (
     SENSOR_NOISE,
-    compute_test_errors,
-    count_covered_errors,
+    compute_test_pose_errors,
+    count_errors_within_intervals,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import build_error_model, load_hybrid, refined_model_parameters
@@ -54,7 +54,7 @@ def test_combinations_of_all_54_exact_errors_come_back(kind, rank):
     assert np.abs(found).max() < 2e-5 and size.max() > 1e-3
     if kind == "poe":
         assert np.abs(away).max() < 1e-6
-    assert max(e.max() for e in compute_test_errors(one, done.robot)) < 1e-8
+    assert max(e.max() for e in compute_test_pose_errors(one, done.robot)) < 1e-8
 
 
 def test_redundancy_is_told_in_words_and_by_its_directions():
@@ -75,7 +75,7 @@ def test_redundancy_is_told_in_words_and_by_its_directions():
 
 
 def test_without_tilt_universal_and_spherical_joints_cannot_be_told_apart():
-    values = measure_rank(1, {}).values
+    values = count_independent_parameters(1, {}).values
     assert (values["rank dh without tilt"], values["rank poe without tilt"]) == (32, 36)
 
 
@@ -102,8 +102,8 @@ def test_noisy_errors_shrink_from_millimetres_to_below_a_tenth_at_poses_not_used
     for document, names in ((True, DOCUMENT), (False, None)):
         one = simulate_robot(5, 25, refined_only=document)
         done = calibrate_hybrid_robot(IWR, one.measurement, "dh", names)
-        before = 1e3 * compute_test_errors(one, IWR)[0]
-        after = 1e3 * compute_test_errors(one, done.robot)[0]
+        before = 1e3 * compute_test_pose_errors(one, IWR)[0]
+        after = 1e3 * compute_test_pose_errors(one, done.robot)[0]
         assert np.sqrt(np.mean(before**2)) > 1.0
         assert np.sqrt(np.mean(after**2)) < 0.1  # the accuracy of Wang 2012, page 19
         assert 0.7 < done.fit.chi < 1.3  # 100 degrees of freedom: 1 +- 0.07
@@ -111,7 +111,7 @@ def test_noisy_errors_shrink_from_millimetres_to_below_a_tenth_at_poses_not_used
 
 def test_intervals_hold_the_planted_errors():
     """12 trials of 36: 432, correlated within a trial; 95 % +- 3 % are seen in twelve."""
-    inside, total = np.sum([count_covered_errors(seed) for seed in range(500, 512)], axis=0)
+    inside, total = np.sum([count_errors_within_intervals(seed) for seed in range(500, 512)], axis=0)
     assert 0.90 < inside / total < 0.99
 
 
@@ -184,7 +184,7 @@ def test_three_methods_agree_on_a_few_parameters():
     one = simulate_robot(11, 8)
     names = ("theta3", "a3", "b1x", "b6z", "l4")
     done = calibrate_hybrid_robot(IWR, one.measurement, "dh", names)
-    eq, fit = fitted_equations(done), done.fit
+    eq, fit = restrict_to_fitted_parameters(done), done.fit
     evolved = minimize_by_evolution(eq.negative_log_likelihood, fit.values - 5e-3, fit.values + 7e-3, seed=1)
     assert evolved.converged
     assert np.abs((evolved.values - fit.values) / fit.standard_deviations).max() < 0.2  # cost within 0.01

@@ -12,7 +12,7 @@ from hydrotele.calibrate.parameter_count import (
     identifiable_rank,
     serial_mechanism,
 )
-from hydrotele.experiments.wang_models import STRAIGHT_HEXAPOD, build_hybrid_robot
+from hydrotele.experiments.wang_models import STRAIGHT_HEXAPOD, build_iwr_mechanism
 
 HINGES = ("revolute", "revolute")
 
@@ -44,8 +44,8 @@ def test_without_loops_equation_5_is_equation_4():
 def test_slides_through_both_joints_lose_one_parameter_per_leg():
     rng = np.random.default_rng(4)
     assert identifiable_rank(STRAIGHT_HEXAPOD, rng, poses=20) == 42
-    assert build_hybrid_robot(straight=True).count_parameters() == 60
-    assert identifiable_rank(build_hybrid_robot(straight=True), rng, poses=20) == 54
+    assert build_iwr_mechanism(straight=True).count_parameters() == 60
+    assert identifiable_rank(build_iwr_mechanism(straight=True), rng, poses=20) == 54
 
 
 def test_too_few_poses_and_a_joint_that_never_moves_lower_the_rank():

@@ -9,10 +9,10 @@ import pytest
 from hydrotele.calibrate.mukca import (
     SocketOptions,
     calibrate_sockets,
-    check_robot,
+    check_robot_fits_sockets,
     choose_robot,
     evaluate_robot,
-    place_frames_near,
+    move_far_frames_near,
     predict_held_out_place,
 )
 from hydrotele.calibrate.sockets import Socket, load_sockets
@@ -28,13 +28,13 @@ PALLETIZER, FREE = DATA / "palletizer", DATA / "palletizer/free.urdf"
 def test_radians_read_as_degrees_are_refused_with_a_hint(folder, robot):
     sockets, _ = load_sockets(folder, degrees=True)
     with pytest.raises(InputError, match=r"% of its free travel \(at most 5 %\).*read as radians.*: give --unit rad$"):
-        check_robot(load_robot(robot), sockets)
+        check_robot_fits_sockets(load_robot(robot), sockets)
 
 
 def test_degrees_read_as_radians_are_refused_with_a_hint():
     sockets = [replace(s, joints=np.degrees(s.joints)) for s in load_sockets(UR)[0]]
     with pytest.raises(InputError, match="read as degrees, the ball of ur5 .*: give --unit deg$"):
-        check_robot(load_robot("ur5"), sockets)
+        check_robot_fits_sockets(load_robot("ur5"), sockets)
     with pytest.raises(InputError, match="no shipped robot fits .*: give --unit deg$"):
         choose_robot(sockets)
 
@@ -49,16 +49,16 @@ def test_other_faults_are_refused_without_a_hint_to_a_unit(fault):
     }[fault]
     changed = [replace(s, joints=change(s.joints)) for s in sockets]
     with pytest.raises(InputError, match="another order, sign or unit") as found:
-        check_robot(load_robot("ur5"), changed)
+        check_robot_fits_sockets(load_robot("ur5"), changed)
     assert "--unit" not in str(found.value)
 
 
 def test_a_wrong_socket_distance_is_refused_before_the_fit():
     sockets, robot = load_sockets(UR)[0], load_robot("ur5")
-    check_robot(robot, sockets, SocketOptions())
+    check_robot_fits_sockets(robot, sockets, SocketOptions())
     message = r"hole_1.csv: with robot ur5 this socket is 50.12 mm from place0/hole_0, not 45 mm: correct --distance"
     with pytest.raises(InputError, match=message):
-        check_robot(robot, sockets, SocketOptions(distance=0.045))
+        check_robot_fits_sockets(robot, sockets, SocketOptions(distance=0.045))
 
 
 @pytest.mark.nightly
@@ -70,7 +70,7 @@ def test_a_fit_with_implausible_lengths_is_not_accepted():
 
 def test_far_frames_are_moved_along_their_axes():
     sockets, far = load_sockets(UR)[0], load_robot(FACTORY)
-    near = place_frames_near(far, sockets)
+    near = move_far_frames_near(far, sockets)
     assert max(np.abs(joint.origin[:3, 3]).max() for joint in far.joints) > 100.0
     assert max(np.abs(joint.origin[:3, 3]).max() for joint in near.joints) < 1.0
     # The same robot: rounding at 278 m is 3e-14 m, times some ten products.

@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 
 import hydrotele
 from hydrotele.cli import main as cli
-from hydrotele.cli.catalogue import format_items, format_summary
+from hydrotele.cli.catalogue import format_items, format_name_lists
 from hydrotele.cli.overview import COMMANDS as SUMMARIES
-from hydrotele.cli.overview import format_overview
+from hydrotele.cli.overview import format_program_help
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, scenarios_folder
 
@@ -110,7 +110,7 @@ def test_overview_lists_every_command_with_the_first_paragraph_of_its_help():
 
 @pytest.mark.parametrize("width", [50, 80, 200])
 def test_overview_fits_the_terminal(width):
-    lines = format_overview(width).splitlines()
+    lines = format_program_help(width).splitlines()
     assert max(map(len, lines)) <= width
     assert all(any(line.startswith(f"  {name} ") for line in lines) for name in SUMMARIES)
 
@@ -131,7 +131,7 @@ def test_overview_imports_nothing_but_the_standard_library():
         print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)
     """
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert found.stderr.strip() == "[]" and found.stdout == f"{format_overview(80)}\n"
+    assert found.stderr.strip() == "[]" and found.stdout == f"{format_program_help(80)}\n"
 
 
 def test_version():
@@ -432,7 +432,7 @@ def test_list(what, whole_list):
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_summary_of_the_list_has_thirty_lines_and_whole_names(width, whole_list):
     every = {kind: [row["name"] for row in rows] for kind, rows in whole_list.items()}
-    lines = format_summary(every, width).splitlines()
+    lines = format_name_lists(every, width).splitlines()
     assert len(lines) <= 30
     shown = set(" ".join(lines).replace(",", " ").split())
     known = {name for some in every.values() for name in some}

@@ -45,5 +45,5 @@ def test_numbers_out_of_their_range_are_refused(words, said):
 
 def test_arguments_that_are_not_utf8_are_refused():
     with pytest.raises(InputError, match=r"^a\\udcff: is not valid UTF-8: rename the file or folder$"):
-        cli._check_arguments(["run", "--out", "a\udcff"])
-    cli._check_arguments(["run", "--out", "é"])
+        cli._check_utf8_arguments(["run", "--out", "a\udcff"])
+    cli._check_utf8_arguments(["run", "--out", "é"])

@@ -7,7 +7,7 @@ from hydrotele.control.plan import Plan
 from hydrotele.control.servo import (
     compute_drive_references,
     interpolate_drive_reference,
-    tabulate_drives,
+    tabulate_drive_geometry,
 )
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo
@@ -25,7 +25,7 @@ def test_drive_row_is_the_servos(name, tool):
     plan = Plan(np.arange(n) / 200.0, axes, np.zeros((n, len(axes))), reference, rate, closed)
     servo = Servo(feedforward=0.9, lead=0.0)
     wanted = compute_drive_references(machine, plan, servo)
-    grid, table = tabulate_drives(machine, axes)
+    grid, table = tabulate_drive_geometry(machine, axes)
     k = len(axes)
     for tick in range(n):
         got = [np.zeros(k) for _ in range(4)]

@@ -11,12 +11,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry, jacobian
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import get_sensors
+from hydrotele.machine.machine import get_sensor_set
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import aligned_positions, start_leapfrog
+from hydrotele.simulate.record import current_aligned_positions, start_leapfrog
 
 CAT = load_machine("cat215", "bucket")
 REAL = "khoshzaban1992"
@@ -48,7 +48,7 @@ def felt_in_plant(machine, kind, force, command, seconds):
             mujoco.mj_step(plant.model, data)
         head, rod = np.zeros(len(plant.axes)), np.zeros(len(plant.axes))
         head[: plant.hydraulic], rod[: plant.hydraulic] = data.act.reshape(-1, 4)[:, 2:].T
-        joint = aligned_positions(plant.model, data)[plant.qpos]
+        joint = current_aligned_positions(plant.model, data)[plant.qpos]
         out.append(felt.update(joint, head, rod).copy())
         tips.append(data.site_xpos[site.id].copy())
     return np.array(out), np.array(tips)
@@ -109,7 +109,7 @@ def test_real_sensors_false_force_is_a_fifth_of_the_static_one(name):
     run = run_scenario(load_scenario(name, {"sensors": REAL, "ground": "false"}))
     size = {}
     for kind in ("static", "dynamic"):
-        sensors = get_sensors(CAT, REAL)
+        sensors = get_sensor_set(CAT, REAL)
         found = endpoint_force_of_log(CAT, run.measured, kind, sensors=sensors)
         r = np.hypot(run.truth["truth.tip.x"], run.truth["truth.tip.y"])
         square = found["r"] ** 2 + found["z"] ** 2 + (found["theta"] / r) ** 2

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.plan import lines_duration, make_plan, quintic_step
+from hydrotele.control.plan import make_plan, quintic_step, tip_moves_duration
 from hydrotele.control.resolved_motion import pose_to_joints
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
@@ -242,7 +242,7 @@ def test_pose_way_through_the_edge_is_refused():
 def test_run_that_ends_early_says_so():
     """With the time that is missing."""
     pilot = {"kind": "lines", "settle": 1.0, "moves": [{"z": 1.2, "speed": 0.5, "pause": 0.5}]}
-    needed = lines_duration(Scenario(name="t", duration=1, pilot=pilot).pilot)
+    needed = tip_moves_duration(Scenario(name="t", duration=1, pilot=pilot).pilot)
     assert needed == pytest.approx(1.0 + 1.2 / 0.5 + 0.5 + 0.5)  # settle, way, one ramp, pause
     assert plan_of(pilot, duration=3.0).notes == ("the run ends 1.4 s before its pilot",)
     assert plan_of(pilot, duration=4.4).notes == ()

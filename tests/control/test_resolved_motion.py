@@ -11,13 +11,13 @@ from hydrotele.control.resolved_motion import (
     ResolvedMotion,
     arm_axes,
     arm_specification,
-    follow_rate,
     pose_to_joints,
+    step_references_by_rate,
 )
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.kinematics.task import task_forward
+from hydrotele.kinematics.task import compute_tip_pose
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Pose
 
@@ -117,14 +117,14 @@ def test_inverse_jacobian_follows_the_rate_and_stops_at_the_edge():
     g, axes, ranges = arm_specification(BUCKET)
     q = np.array([(HOME | {"swing": 0.0})[axis] for axis in axes])
     pose, speed, rate = np.zeros(5), np.zeros(len(q)), np.array([0.0, 0.0, 0.5, 0.0, 0.0])
-    task_forward(g, q, pose)
+    compute_tip_pose(g, q, pose)
     start = pose.copy()
     for _ in range(200):
-        assert not follow_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed)
+        assert not step_references_by_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed)
     np.testing.assert_allclose(pose[:4], start[:4] + [0.0, 0.0, 0.5, 0.0], atol=2e-3)
     rate[:] = 1.0, 0.0, 0.0, 0.0, 0.0
-    held = [follow_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed) for _ in range(2000)]
+    held = [step_references_by_rate(g, ranges, q.copy(), rate, 0.005, pose, q, speed) for _ in range(2000)]
     assert held[-1] and np.all(speed == 0.0)
     assert np.all((ranges[:, 0] <= q) & (q <= ranges[:, 1]))
-    assert follow_rate(g, ranges, np.full(len(q), np.nan), -rate, 0.005, pose, q, speed)
-    assert not follow_rate(g, ranges, q.copy(), -rate, 0.005, pose, q, speed)
+    assert step_references_by_rate(g, ranges, np.full(len(q), np.nan), -rate, 0.005, pose, q, speed)
+    assert not step_references_by_rate(g, ranges, q.copy(), -rate, 0.005, pose, q, speed)

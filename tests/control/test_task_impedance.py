@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.state_filter import filter_signal, filter_table
+from hydrotele.control.state_filter import filter_signal, filter_step_matrix
 from hydrotele.control.task_impedance import TaskImpedance
 
 PERIOD, BANDS = 0.02, (3.0, 1.5)
@@ -17,7 +17,7 @@ def planted(late: bool):
     force = -(STIFFNESS * place + DAMPING * np.gradient(place, PERIOD))
     if late:
         for band in BANDS:
-            force = filter_signal(filter_table(band, PERIOD), force)[:, 0]
+            force = filter_signal(filter_step_matrix(band, PERIOD), force)[:, 0]
     force[600:] = 0.0
     task = TaskImpedance(2, PERIOD, BANDS, force_is_filtered=late)
     for row in range(600):
@@ -50,7 +50,7 @@ def test_planted_mass_is_recovered(late):
     force = -(STIFFNESS * place + DAMPING * rate + mass * change)
     if late:
         for band in BANDS:
-            force = filter_signal(filter_table(band, PERIOD), force)[:, 0]
+            force = filter_signal(filter_step_matrix(band, PERIOD), force)[:, 0]
     task = TaskImpedance(1, PERIOD, BANDS, force_is_filtered=late)
     for row in range(600):
         task.update(force[[row]], place[[row]])

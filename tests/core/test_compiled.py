@@ -13,10 +13,10 @@ from numba.core.errors import TypingError
 
 import hydrotele
 from hydrotele.core.compile_progress import format_bar
-from hydrotele.core.compiled import allocation_free
+from hydrotele.core.compiled import compile_without_allocation
 
 
-@allocation_free
+@compile_without_allocation
 def _double(values):
     part = values[1:]
     for i in range(len(part)):
@@ -24,12 +24,12 @@ def _double(values):
     return values[0]
 
 
-@allocation_free
+@compile_without_allocation
 def _creates(size):
     return np.zeros(size).sum()
 
 
-@allocation_free
+@compile_without_allocation
 def _returns_part(values):
     return values[1:]
 

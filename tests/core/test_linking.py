@@ -12,7 +12,7 @@ import pytest
 from numba.core.errors import TypingError
 
 import hydrotele
-from hydrotele.core.compiled import allocation_free, compiled
+from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.references import MAX_ARGUMENTS_BY_VALUE, Reference
 
 PACKAGE = Path(hydrotele.__file__).parent
@@ -96,13 +96,13 @@ def outer(factor: float) -> Outer:
     )  # fmt: skip
 
 
-@allocation_free
+@compile_without_allocation
 def _scale(inner, factor):
     for i in range(inner.count):
         inner.values[i] *= factor
 
 
-@allocation_free
+@compile_without_allocation
 def _work(o, k):
     _scale(o.inner, o.factor)
     inner, matrix, _, numbers, _, factor, active = o

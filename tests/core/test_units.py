@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hydrotele.core.units import UNITS, axis_unit, display_unit, to_si
+from hydrotele.core.units import UNITS, display_unit, plot_axis_unit, si_unit_and_factor
 from hydrotele.machine import signals
 
 
@@ -22,8 +22,8 @@ from hydrotele.machine import signals
     ],
 )
 def test_conversion_to_si(unit, si, factor):
-    assert to_si(unit)[0] == si
-    assert to_si(unit)[1] == pytest.approx(factor, rel=1e-14)  # rounding of one division
+    assert si_unit_and_factor(unit)[0] == si
+    assert si_unit_and_factor(unit)[1] == pytest.approx(factor, rel=1e-14)  # rounding of one division
 
 
 def test_units_of_channels_are_si_and_every_unit_leads_to_one():
@@ -39,11 +39,11 @@ SI = ("1", "m", "rad", "s", "Pa", "m^3/s", "m^3/(s Pa)", "m^3/Pa", "N", "N m", "
 @pytest.mark.parametrize("unit", SI)
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 2.0, 1e4, 1e9])
 def test_units_for_people_lead_back_to_the_si_unit(unit, size):
-    for shown, factor in (axis_unit(unit), display_unit(unit, size)):
-        assert to_si(shown)[0] == unit
-        assert factor * to_si(shown)[1] == pytest.approx(1.0, rel=1e-14)  # rounding of a division
+    for shown, factor in (plot_axis_unit(unit), display_unit(unit, size)):
+        assert si_unit_and_factor(shown)[0] == unit
+        assert factor * si_unit_and_factor(shown)[1] == pytest.approx(1.0, rel=1e-14)  # rounding of a division
 
 
 def test_a_litre_per_minute_and_100_bar_by_their_definitions():
-    assert to_si("L/min per 100 bar")[1] == pytest.approx(1e-3 / 60 / 100e5)
-    assert to_si("cm³/bar") == ("m^3/Pa", pytest.approx(1e-6 / 1e5))
+    assert si_unit_and_factor("L/min per 100 bar")[1] == pytest.approx(1e-3 / 60 / 100e5)
+    assert si_unit_and_factor("cm³/bar") == ("m^3/Pa", pytest.approx(1e-6 / 1e5))

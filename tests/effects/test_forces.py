@@ -189,7 +189,7 @@ def friction_at(machine, axis, speed):
         mujoco.mj_fwdActuation(plant.model, data)
         chambers = 0.0
         if i < plant.hydraulic:
-            head, rod = machine.axes[axis].hydraulic_drive.areas
+            head, rod = machine.axes[axis].hydraulic_drive.effective_areas
             p = data.act + plant.model.opt.timestep * data.act_dot
             chambers = head * p[4 * i + 2] - rod * p[4 * i + 3]
         forces.append(data.actuator_force[i] - chambers)

@@ -8,7 +8,7 @@ from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import state_flows
+from hydrotele.simulate.record import compute_state_flows_and_forces
 
 BOOM = 1  # place of the boom among the axes of the CAT 215
 NOMINAL = load_machine("cat215")
@@ -21,7 +21,7 @@ def flows(machine, spool):
     data.act[ACTIVATIONS_PER_AXIS * BOOM] = spool
     count = plant.hydraulic
     user = plant.model.actuator_user.ravel()
-    table = state_flows(user, count, data.act[None], np.full((1, count), 0.5), np.zeros((1, count)))
+    table = compute_state_flows_and_forces(user, count, data.act[None], np.full((1, count), 0.5), np.zeros((1, count)))
     return table[0, 0], table[0, 1 + 3 * BOOM]
 
 
@@ -75,7 +75,7 @@ def test_leakage_flows_from_side_to_side():
     more, dp = 5e-11, 10e6
     leaky = apply_effect(NOMINAL, "internal_leakage", "boom", {"leakage": 2e-12 + more})
     (rate, x), (nominal, _) = pressure_rate(leaky, 0.0, dp), pressure_rate(NOMINAL, 0.0, dp)
-    volume = NOMINAL.axes["boom"].cylinder.volumes(np.array(x))[0]
+    volume = NOMINAL.axes["boom"].cylinder.chamber_volumes(np.array(x))[0]
     stiffness = NOMINAL.supply.bulk_modulus / volume
     assert rate - nominal == pytest.approx(-stiffness * more * dp, rel=1e-4)
 
@@ -85,7 +85,7 @@ def test_spool_leakage_leaves_for_the_tank():
     leak = 2e-11
     leaky = apply_effect(NOMINAL, "tank_leakage", "boom", {"leakage": leak})
     (rate, x), (nominal, _) = pressure_rate(leaky), pressure_rate(NOMINAL)
-    volume = NOMINAL.axes["boom"].cylinder.volumes(np.array(x))[0]
+    volume = NOMINAL.axes["boom"].cylinder.chamber_volumes(np.array(x))[0]
     plant = build_plant(NOMINAL, ground=False)
     above = rest_state(plant).act[ACTIVATIONS_PER_AXIS * BOOM + 3] - NOMINAL.supply.tank_pressure
     wanted = -NOMINAL.supply.bulk_modulus / volume * leak * above
@@ -101,7 +101,7 @@ def test_hoses_and_oil_soften_the_chamber():
     for machine, modulus, hose in ((NOMINAL, beta, 0.0), (hosed, beta, soft),
                                    (airy, 0.5 * beta, 0.0)):  # fmt: skip
         rate, x = pressure_rate(machine, v)
-        volume = cylinder.volumes(np.array(x))[0]
+        volume = cylinder.chamber_volumes(np.array(x))[0]
         wanted = -cylinder.area_head * v / (volume / modulus + hose)
         assert rate == pytest.approx(wanted, rel=1e-4)
 

@@ -138,7 +138,7 @@ def test_an_error_inside_a_file_of_effects_ends_a_command_with_the_traceback_of_
     )
     monkeypatch.setattr(sys, "argv", ["hydrotele", "list", "effects", "--effects", str(file)])
     with pytest.raises(SystemExit, match="2"):
-        main._run()
+        main._run_app_and_report_errors()
     error = capsys.readouterr().err.splitlines()
     kind = {"1 / 0": "ZeroDivisionError", "exit(0)": "SystemExit"}.get(line, "FileNotFoundError")
     assert error[0].startswith(f"error {file}:6: {kind}: ")

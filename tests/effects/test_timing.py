@@ -10,7 +10,7 @@ from hydrotele.effects import apply_effect
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
-from hydrotele.run.run import prepare, run_scenario
+from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.record import (
@@ -218,7 +218,7 @@ def test_the_controller_sees_what_the_log_shows():
     """Same defects, noise and converter in the fed-back reading and in the log's row."""
     asked = scenario(*DEFECTS, sensors="khoshzaban1992")
     measured = run_scenario(asked).measured
-    plant, data, plan, seen = prepare(asked)
+    plant, data, plan, seen = prepare_run(asked)
     start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, 20)
     for tick in range(50):

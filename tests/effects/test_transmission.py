@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.effects.transmission import load_inertia, min_resolvable_inertia
+from hydrotele.effects.transmission import load_inertia, raise_to_resolvable_inertia
 from hydrotele.hydraulics.circuit import SLOT_COUNT, actuator_friction, implicit_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
@@ -16,7 +16,7 @@ from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.closure import holding_forces, independent_dofs
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
-from hydrotele.simulate.record import aligned_positions, start_leapfrog
+from hydrotele.simulate.record import current_aligned_positions, start_leapfrog
 
 MACHINE = load_machine("cat215")
 GAP = 0.02
@@ -60,7 +60,7 @@ def test_the_rotor_crosses_the_gap_before_the_load_moves():
     for step in range(4000):
         data.ctrl[0] = 0.4 if step < 2000 else -0.4
         mujoco.mj_step(plant.model, data)
-        q = aligned_positions(plant.model, data)
+        q = current_aligned_positions(plant.model, data)
         lead.append(q[rotor] - q[ring])
         load.append(q[ring])
         if alone and lead[-1] < GAP / 2:
@@ -132,7 +132,7 @@ def test_a_drive_as_heavy_as_usual_need_not_be_stated(compliance):
     """The rig's rod, 3 kg, is lighter than what its oil can be stepped with: 23 kg, then usual."""
     machine = load_machine("rig")
     table = EFFECTS["joint_flexibility"].parameters(machine, "slide")
-    least = min_resolvable_inertia(machine, "slide", 0.0, 0.0)
+    least = raise_to_resolvable_inertia(machine, "slide", 0.0, 0.0)
     assert table["drive_inertia"].nominal == table["drive_inertia"].lower_bound == least > 20.0
     given = {"compliance": compliance}
     stated = {**given, **{key: table[key].nominal for key in ("drive_inertia", "damping_ratio")}}
@@ -190,7 +190,7 @@ def motion(machine, timestep, seconds=3.0):
     start_leapfrog(plant.model, data)
     rows = []
     for row in range(round(seconds / 0.02)):
-        rows.append(aligned_positions(plant.model, data)[plant.qpos])
+        rows.append(current_aligned_positions(plant.model, data)[plant.qpos])
         data.ctrl[:] = 0.35 * np.sin(1.5 * 0.02 * row * np.array([1.7, 2.3, 2.9][: len(data.ctrl)]))
         mujoco.mj_step(plant.model, data, nstep=round(0.02 / timestep))
     return np.array(rows)

@@ -9,13 +9,13 @@ from hydrotele.envs.controllers.catalogue import (
     REFERENCE_CONTROLLERS,
     make_controller,
 )
-from hydrotele.envs.controllers.controller import find_columns
+from hydrotele.envs.controllers.controller import find_observation_columns
 from hydrotele.envs.controllers.track import ReferencePreview, make_track_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.envs.track import PREVIEW_TIMES, track_reference
+from hydrotele.envs.track import PREVIEW_TIMES, compute_axis_reference
 
 _SHORT = Options(variants=2, duration=3.0)
 
@@ -58,7 +58,7 @@ def test_references_between_those_shown_are_those_of_the_task():
     for ahead in (0.0, 0.06, 0.3, PREVIEW_TIMES[-1]):
         place, rate = preview.interpolate(core.observation, ahead)
         for n in range(4):
-            true = [track_reference.py_func(core.episodes["goal"][n], i, now + ahead) for i in (0, 1, 2)]
+            true = [compute_axis_reference.py_func(core.episodes["goal"][n], i, now + ahead) for i in (0, 1, 2)]
             # fifth derivative of 0.3 rad at 2.4 rad/s over 0.4 s: some 1e-4
             assert place[n] == pytest.approx([t[0] for t in true], abs=5e-4)
             assert rate[n] == pytest.approx([t[1] for t in true], abs=5e-3)
@@ -89,4 +89,4 @@ def test_every_task_has_controllers_and_others_are_refused():
     with pytest.raises(InputError, match="pid"):
         make_controller("pid", setup)
     with pytest.raises(InputError, match="angle.boom"):
-        find_columns(setup, "angle", ["bom"])
+        find_observation_columns(setup, "angle", ["bom"])

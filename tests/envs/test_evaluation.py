@@ -7,9 +7,9 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP
-from hydrotele.envs.evaluation import compare_scores, evaluate
+from hydrotele.envs.evaluation import evaluate_controller, tabulate_scores
 from hydrotele.envs.making import TASKS
-from hydrotele.envs.stable_baselines import AgentInterface, find_reference_pairs
+from hydrotele.envs.stable_baselines import AgentInterface, find_reference_and_measured_columns
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
@@ -22,7 +22,7 @@ def _core(count=3, autoreset=DISABLED, **choices) -> TaskCore:
 
 def test_figures_are_those_of_the_episodes():
     core = _core()
-    scores = evaluate(core, make_controller("random", core.setup), 6, seed=4)
+    scores = evaluate_controller(core, make_controller("random", core.setup), 6, seed=4)
     alone = _core(count=1)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1.0, 1.0, (25, 3, 3))  # as the controller draws them for the batch
@@ -40,7 +40,7 @@ def test_figures_are_those_of_the_episodes():
     assert len(scores.results["return"]) == 6
     assert scores.results["length"] == pytest.approx(np.full(6, 0.5))
     assert scores.standard_error("return") == pytest.approx(scores.results["return"].std(ddof=1) / 6**0.5)
-    assert f"{scores.mean('return'):.4g} ±" in compare_scores([("random", scores)], ["return"])
+    assert f"{scores.mean('return'):.4g} ±" in tabulate_scores([("random", scores)], ["return"])
 
 
 def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
@@ -53,7 +53,7 @@ def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
             core.episodes["over"][1] = 1
 
     monkeypatch.setattr(core, "step", faulty)
-    scores = evaluate(core, make_controller("zero", core.setup), 3)
+    scores = evaluate_controller(core, make_controller("zero", core.setup), 3)
     assert scores.results["length"] == pytest.approx([0.5, 0.14, 0.5])
     assert scores.results["return"][1] <= 7.0
 
@@ -61,7 +61,7 @@ def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
 def test_a_core_that_begins_anew_by_itself_is_refused():
     core = _core(autoreset=NEXT_STEP)
     with pytest.raises(InputError, match="DISABLED"):
-        evaluate(core, make_controller("zero", core.setup), 1)
+        evaluate_controller(core, make_controller("zero", core.setup), 1)
 
 
 def test_the_usual_spread_suits_every_task_and_changes_the_machine():
@@ -81,33 +81,33 @@ def test_an_agent_sees_errors_and_the_past_and_corrects_a_law():
         AgentInterface(core.setup, 2),
     )
     fields = [field.name for field in core.setup.fields]
-    asked, measured = find_reference_pairs(core.setup)
+    asked, measured = find_reference_and_measured_columns(core.setup)
     pairs = {(fields[a], fields[m]) for a, m in zip(asked, measured, strict=True)}
     assert ("reference.boom", "angle.boom") in pairs
     assert ("reference_rate.boom", "rate.boom") in pairs
     core.reset(np.arange(3))
     view.begin(3)
     alone.begin(3)
-    seen = view.observe(core.observation)
+    seen = view.make_agent_observation(core.observation)
     width = alone.observation_size // 2
     assert seen.shape == (3, view.observation_size) == (3, 3 * width + 3)
     first = core.observation.copy()
-    given = view.convert_action(np.ones((3, 3)))
+    given = view.make_environment_action(np.ones((3, 3)))
     law.begin(3)
     assert given == pytest.approx(np.clip(np.clip(law(first), -1, 1) + 0.25, -1, 1), abs=1e-6)
-    assert np.array_equal(alone.convert_action(2.0 * np.ones((3, 3))), np.ones((3, 3)))
-    alone.observe(core.observation)
+    assert np.array_equal(alone.make_environment_action(2.0 * np.ones((3, 3))), np.ones((3, 3)))
+    alone.make_agent_observation(core.observation)
     core.step(given)
-    later = alone.observe(core.observation)
+    later = alone.make_agent_observation(core.observation)
     assert np.array_equal(later[:, : len(fields)], core.observation)
     assert np.array_equal(later[:, width : width + len(fields)], first)
     place = len(fields) + list(asked).index(fields.index("reference.boom"))
     error = core.observation[:, fields.index("reference.boom")]
     error = error - core.observation[:, fields.index("angle.boom")]
     assert np.array_equal(later[:, place], error)
-    last = alone.observe_final(core.observation, np.array([1]))
+    last = alone.make_final_agent_observation(core.observation, np.array([1]))
     assert np.array_equal(last[0, :width], later[1, :width])
     assert np.array_equal(last[0, width:], later[1, :width])
     alone.reset(np.array([False, True, False]))
-    anew = alone.observe(core.observation)
+    anew = alone.make_agent_observation(core.observation)
     assert np.array_equal(anew[1, :width], anew[1, width:])

@@ -8,7 +8,7 @@ from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.force import FAILURE_REWARD, MAX_CELL_ERROR
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.simulate.record import surrounding_bodies, total_contact_force
+from hydrotele.simulate.record import mark_surrounding_bodies, total_contact_force
 
 FORCE = TASKS["HoldForce"]
 COUNT = 6
@@ -44,7 +44,7 @@ def test_the_load_cell_reads_the_contact_force_of_every_plate(core):
     assert len(set(core.episodes["variant"].tolist())) > 1
     assert not seen(core, "force").any()
     press(core, 7.0)
-    around = surrounding_bodies(core.setup.variants.plant)
+    around = mark_surrounding_bodies(core.setup.variants.plant)
     plates = set()
     for n in range(COUNT):
         model, data = core.copy_model_and_data(n)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.controllers.controller import find_columns
+from hydrotele.envs.controllers.controller import find_observation_columns
 from hydrotele.envs.controllers.grade import DUMP, GradeController
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
@@ -31,12 +31,12 @@ from hydrotele.envs.grade import (
     SUCCESS_REWARD,
     TERRAIN_SIZE,
     TIME_COST,
-    bed_parameters,
-    section_radii,
+    pack_soil_bed_parameters,
+    profile_section_radii,
 )
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.kinematics.task import REACHED, task_inverse
+from hydrotele.kinematics.task import REACHED, solve_joint_angles
 from hydrotele.soil.facts import (
     CARRIED_VOLUME,
     CAT215,
@@ -50,7 +50,7 @@ from hydrotele.soil.facts import (
     STATE_SIZE,
     SWELL,
     pack_soil_parameters,
-    soil_mass,
+    total_soil_mass,
 )
 from hydrotele.soil.step import compute_bucket_wrench
 
@@ -72,7 +72,7 @@ def parts(core: TaskCore, number: int):
 
 def mass(core: TaskCore, number: int) -> float:
     surface, loose, state, _, numbers = parts(core, number)
-    return soil_mass(numbers, surface, loose, state)
+    return total_soil_mass(numbers, surface, loose, state)
 
 
 def error(core: TaskCore, number: int) -> np.ndarray:
@@ -165,14 +165,16 @@ def test_error_and_observation_are_those_of_the_profile():
         over = error(core, n)
         assert core.episodes["goal"][n, LAST_ERROR] == pytest.approx(np.sqrt(np.mean(over**2)))
         assert core.measures[n, 0] == core.episodes["goal"][n, LAST_ERROR]
-        seen = core.observation[n, find_columns(core.setup, "profile_error", map(str, range(SECTION_COUNT)))]
+        seen = core.observation[
+            n, find_observation_columns(core.setup, "profile_error", map(str, range(SECTION_COUNT)))
+        ]
         assert seen == pytest.approx(over.reshape(SECTION_COUNT, -1).mean(1), abs=1e-6)
         middles = RADII[(RADII > MIN_RADIUS) & (RADII < MAX_RADIUS)].reshape(SECTION_COUNT, -1).mean(1)
-        assert middles == pytest.approx(section_radii())
+        assert middles == pytest.approx(profile_section_radii())
         # cut, never filled: the ground lies over the plane everywhere, which lies over z = 0
         assert (over > 0.0).all()
-        r, z = core.observation[n, find_columns(core.setup, "tip", "rz")]
-        height = core.observation[n, find_columns(core.setup, "edge_height", [""])[0]]
+        r, z = core.observation[n, find_observation_columns(core.setup, "tip", "rz")]
+        height = core.observation[n, find_observation_columns(core.setup, "edge_height", [""])[0]]
         assert z - height == pytest.approx(np.interp(r, RADII, parts(core, n)[0]), abs=1e-5)
 
 
@@ -223,7 +225,7 @@ def test_all_planes_that_are_drawn_can_be_reached():
         for r, attitude in ((MIN_RADIUS, -121.0), (MEAN_RADIUS, -113.0), (MAX_RADIUS, -106.0)):
             z = goal[PLANE_HEIGHT] + math.tan(goal[PLANE_SLOPE]) * (r - MEAN_RADIUS)
             pose = np.array([r, 0.0, z, math.radians(attitude), 0.0])
-            assert task_inverse(arm, pose, 0.0, q) == REACHED
+            assert solve_joint_angles(arm, pose, 0.0, q) == REACHED
             assert ((ranges[:, 0] < q) & (q < ranges[:, 1])).all()
 
 
@@ -234,4 +236,4 @@ def test_episodes_have_the_soils_they_are_said_to_have():
         assert np.array_equal(parts(core, n)[4], pack_soil_parameters(soil, CAT215, PROFILE_START, CELL_LENGTH))
     assert core.terrain.shape[1] == TERRAIN_SIZE
     with pytest.raises(InputError, match="1 to 3 soils"):
-        bed_parameters([SOILS["firm"]] * 4)
+        pack_soil_bed_parameters([SOILS["firm"]] * 4)

@@ -6,10 +6,10 @@ import pytest
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import MAX_ARM_AXES
 from hydrotele.envs.facts import full_action_rate
-from hydrotele.envs.line import SETTLE_TIME, compute_line_pose, line_travel
+from hydrotele.envs.line import SETTLE_TIME, compute_line_pose, compute_line_travel
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.kinematics.task import REACHED, task_inverse
+from hydrotele.kinematics.task import REACHED, solve_joint_angles
 
 LINE = TASKS["StraightLine"]
 COUNT = 48
@@ -45,7 +45,7 @@ def test_every_line_lies_in_the_workspace_and_asks_less_than_the_drives_have(cor
         joints = np.zeros((len(times), 4))
         for row, time in zip(joints, times, strict=True):
             pose = place(goal, time)[0]
-            assert task_inverse(arm, pose, pose[1], row) == REACHED
+            assert solve_joint_angles(arm, pose, pose[1], row) == REACHED
             assert pose[2] > 0.0
         assert (ranges[:, 0] <= joints).all()
         assert (joints <= ranges[:, 1]).all()
@@ -71,7 +71,7 @@ def test_the_speed_is_that_of_the_way_and_changes_no_faster_than_drawn(goals):
     step = 1e-3
     times = np.arange(0.0, 16.0, step)
     for goal in goals[:5]:
-        way, speed = np.array([line_travel(goal, time) for time in times]).T
+        way, speed = np.array([compute_line_travel(goal, time) for time in times]).T
         # a trapezoid's mean over a step is its middle, but for the steps with a corner
         assert np.allclose(np.diff(way) / step, 0.5 * (speed[1:] + speed[:-1]), atol=step)
         assert 0.5 <= np.abs(np.diff(speed)).max() / step <= 1.0 + 1e-9

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hydrotele.envs.controllers.catalogue import make_controller
-from hydrotele.envs.controllers.place import SWING_PERIOD, move_fraction
+from hydrotele.envs.controllers.place import SWING_PERIOD, trapezoidal_move_fraction
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.making import TASKS
@@ -20,7 +20,7 @@ from hydrotele.envs.place import (
     STEP_COST,
     SUCCESS_REWARD,
     TILT_COST,
-    yaw_difference,
+    undirected_yaw_difference,
 )
 from hydrotele.envs.task import Options
 from hydrotele.simulate.fleet import STATE_KIND
@@ -239,7 +239,7 @@ def test_goals_lie_where_a_log_can_be_brought():
      (math.pi - 0.1, 0.2, 0.3)],
 )  # fmt: skip
 def test_ends_of_a_log_are_alike(first, second, between):
-    angle = yaw_difference.py_func(math.sin(2.0 * first), math.cos(2.0 * first), second)
+    angle = undirected_yaw_difference.py_func(math.sin(2.0 * first), math.cos(2.0 * first), second)
     assert angle == pytest.approx(between, abs=1e-12)
 
 
@@ -249,7 +249,7 @@ def test_moves_leave_a_pendulum_of_their_period_at_rest(length):
     step, turning = 1.0e-3, 2.0 * math.pi / SWING_PERIOD
     time = np.arange(-5, int((length + SWING_PERIOD) / step) + 5) * step
     one = np.ones(len(time))
-    share = move_fraction(time, length * one, SWING_PERIOD * one)
+    share = trapezoidal_move_fraction(time, length * one, SWING_PERIOD * one)
     assert share[0] == 0.0 and share[-1] == pytest.approx(1.0)
     push = -np.diff(share, 2) / step**2
     c, s = math.cos(turning * step), math.sin(turning * step)

@@ -8,8 +8,8 @@ from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, MAX_ARM_AXES
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.reach import STEP_COST, SUCCESS_REWARD
-from hydrotele.envs.task import Options, draw_start
-from hydrotele.kinematics.task import REACHED, task_forward, task_inverse
+from hydrotele.envs.task import Options, sample_start_positions
+from hydrotele.kinematics.task import REACHED, compute_tip_pose, solve_joint_angles
 
 REACH = TASKS["ReachFeller"]
 COUNT = 32
@@ -22,7 +22,7 @@ def core() -> TaskCore:
 
 def true_pose(core: TaskCore, n: int) -> np.ndarray:
     pose = np.zeros(MAX_ARM_AXES)
-    task_forward(core.parameters["arm"], core.episodes["position"][n, :5], pose)
+    compute_tip_pose(core.parameters["arm"], core.episodes["position"][n, :5], pose)
     return pose
 
 
@@ -46,7 +46,7 @@ def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
             start, goal = true_pose(core, n), core.episodes["goal"][n, :MAX_ARM_AXES].copy()
             for part in np.linspace(0.0, 1.0, 50):
                 pose = start + part * (goal - start)
-                assert task_inverse(arm, pose, pose[1], joints) == REACHED
+                assert solve_joint_angles(arm, pose, pose[1], joints) == REACHED
                 assert (ranges[:, 0] <= joints).all()
                 assert (joints <= ranges[:, 1]).all()
             assert goal[2] >= 0.8
@@ -106,4 +106,4 @@ def test_leaving_the_pose_begins_the_time_anew(core):
 
 def test_a_start_that_no_arm_can_take_is_refused(core):
     with pytest.raises(InputError, match="reached"):
-        draw_start(core.setup.machine, np.random.default_rng(0), (30.0,) * 5, (31.0,) * 5)
+        sample_start_positions(core.setup.machine, np.random.default_rng(0), (30.0,) * 5, (31.0,) * 5)

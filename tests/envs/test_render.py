@@ -17,7 +17,7 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.making import MachineEnv, MachineVectorEnv
-from hydrotele.envs.stage import TaskRenderer, goal_markers
+from hydrotele.envs.stage import TaskRenderer, make_goal_markers
 from hydrotele.show.canvas import Canvas
 
 
@@ -99,7 +99,7 @@ def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(na
     stage.update()
     bare = canvas.draw(stage.model, stage.data, stage.find_camera())
     assert (bare != first).any()
-    marked = canvas.draw(stage.model, stage.data, stage.find_camera(), stage.markers())
+    marked = canvas.draw(stage.model, stage.data, stage.find_camera(), stage.make_markers())
     assert np.array_equal(marked, first)
     canvas.close()
     for _ in range(50):
@@ -112,7 +112,7 @@ def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(na
 def test_every_task_marks_its_goal(name):
     env = MachineEnv(name, action="joint_rate", **SMALL)
     env.reset(seed=1)
-    assert TaskRenderer(env.core).markers()
+    assert TaskRenderer(env.core).make_markers()
     env.close()
 
 
@@ -128,7 +128,7 @@ def test_the_drawn_machine_stands_where_the_simulated_one_does(env):
 
 
 def test_the_goal_starts_at_the_tip_and_goes_where_the_reference_does(env):
-    ball, off, *way = goal_markers(env.core, 0)
+    ball, off, *way = make_goal_markers(env.core, 0)
     tip = env.core.episodes["tip"][0]
     # float arithmetic of closed kinematics against MuJoCo's pins, which open by 0.1 mm
     assert ball.start == pytest.approx(tip, abs=2e-3)

@@ -6,7 +6,7 @@ import pytest
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.envs.track import track_reference
+from hydrotele.envs.track import compute_axis_reference
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def core() -> TaskCore:
 def course(core: TaskCore, number: int, axis: int, times: np.ndarray) -> np.ndarray:
     """(n, 2) reference and rate."""
     goal = core.episodes["goal"][number]
-    return np.array([track_reference.py_func(goal, axis, time) for time in times])
+    return np.array([compute_axis_reference.py_func(goal, axis, time) for time in times])
 
 
 @pytest.mark.nightly

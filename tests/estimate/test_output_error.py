@@ -19,7 +19,7 @@ from hydrotele.estimate.output_error import (
     timing,
     uncertain_parameters,
 )
-from hydrotele.kinematics.from_machine import axis_linkage, range_at_drive
+from hydrotele.kinematics.from_machine import axis_linkage, joint_range_at_drive
 from hydrotele.logs.dataset import RunData, load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.drives import FlowCurve, Metering
@@ -58,7 +58,7 @@ def test_a_moved_linkage_keeps_the_joint_between_the_same_ends(axis):
     machine = load_machine("ec20")
     hypothesis = linkage(machine, axis)
     moved = hypothesis.change(machine, {"base": 0.1, "rod": 0.05, "angle": 0.05})
-    before, after = range_at_drive(machine, axis), range_at_drive(moved, axis)
+    before, after = joint_range_at_drive(machine, axis), joint_range_at_drive(moved, axis)
     old, new = machine.axes[axis].cylinder, moved.axes[axis].cylinder
     assert after[0] == pytest.approx(before[0], abs=1e-12)
     assert new.stroke - after[1] == pytest.approx(old.stroke - before[1], abs=1e-12)

@@ -10,7 +10,7 @@ from hydrotele.estimate.filter import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
-from hydrotele.hydraulics.parameters import max_time_step
+from hydrotele.hydraulics.parameters import max_pump_drive_time_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import RunRows, average_rows
@@ -136,14 +136,14 @@ def test_friction_that_holds_resists_a_term(machine):
 
 def test_longest_step_halves_until_the_oil_is_followed(machine, stiff):
     """`h = 1 / omega` with little friction; at that step a free run stays with a fine one."""
-    h = max_time_step(stiff, "piston")
+    h = max_pump_drive_time_step(stiff, "piston")
     assert math.log2(h / 1.0e-3) == round(math.log2(h / 1.0e-3))
-    area_head, area_rod = stiff.axes["piston"].cylinder.areas
+    area_head, area_rod = stiff.axes["piston"].cylinder.effective_areas
     volume, stroke = 30.0e-6, 0.075
     oil = 1.0e9 * (area_head**2 / volume + area_rod**2 / (volume + area_rod * stroke))
     omega = math.sqrt((oil + 3.0e7) / 50.0)
     assert 0.4 / omega < h <= 1.05 / omega  # friction allows a little more than 1 / omega
-    assert h < max_time_step(machine, "piston")
+    assert h < max_pump_drive_time_step(machine, "piston")
     coarse, fine = (simulated(stiff, round(PERIOD / step))[0] for step in (h, h / 8))
     assert np.abs(coarse - fine)[:, 0].max() < 2.0e-4  # m, over 5 s
 

@@ -185,7 +185,7 @@ def test_a_cylinder_that_runs_into_its_end(machine_of, reduced_of, size):
     end = run.truth["length.slide"][-1]
     depth = end - machine.axes["slide"].cylinder.stroke if size > 0 else -end
     rest = {side: run.truth[f"pressure_{side}.slide"][-1] for side in ("head", "rod")}
-    head, rod = machine.axes["slide"].cylinder.areas
+    head, rod = machine.axes["slide"].cylinder.effective_areas
     push = abs(head * rest["head"] - rod * rest["rod"])
     # pressed in by the force over the stiffness; 150 N of dry friction may hold some of it back
     stiffness = machine.end_stop("slide").stiffness

@@ -90,7 +90,7 @@ def test_rest_is_rest(name, machine_of, reduced_of):
     load = space.motion.basis.T @ space.motion.joint[BIAS]
     forces, first = np.linalg.solve(space.row.T, load), 2 * len(load)
     for i, axis in enumerate(machine.hydraulic_axes.values()):
-        area_head, area_rod = axis.hydraulic_drive.areas
+        area_head, area_rod = axis.hydraulic_drive.effective_areas
         z[first + 4 * i + 2] = (forces[i] + area_rod * z[first + 4 * i + 3]) / area_head
     place(model, space, z)  # which takes up the pressures
     accelerate(model, space, z, 0.0)

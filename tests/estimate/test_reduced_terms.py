@@ -10,7 +10,7 @@ from hydrotele.estimate.reduced_model import simulate_rows
 from hydrotele.hydraulics.circuit import NO_EXTRA_STATES, circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.law import Drives
-from hydrotele.terms.table import terms_table
+from hydrotele.terms.table import encode_terms_table
 
 PERIOD = 0.02
 
@@ -93,7 +93,7 @@ def still_circuit(machine, terms, pressures, dt, end):
     user, count = np.concatenate(list(actuator_parameters(machine).values())), len(order)
     act, rate = np.zeros(4 * count), np.zeros(4 * count)
     act[2::4], act[3::4] = pressures
-    zeros, table = np.zeros(count), terms_table(terms, order)
+    zeros, table = np.zeros(count), encode_terms_table(terms, order)
     x = np.full(count, 0.5)
     for k in range(round(end / dt)):
         drives = Drives(count, act, x, zeros, zeros)

@@ -24,7 +24,7 @@ from hydrotele.experiments.palida import (
     simulate_measurement,
     track_path,
 )
-from hydrotele.identify.estimation import estimate
+from hydrotele.identify.estimation import estimate_linear_parameters
 
 ITEMS = (
     "Table 1", "Table 2", "Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Fig. 5", "Fig. 6", "Fig. 7",
@@ -63,7 +63,7 @@ def test_unknown_settings_are_refused(one):
 def test_null_space_rules_and_table_1_give_the_same_base_parameters():
     rows = judge_repeatedly(palida_base.STRUCTURE, 1)
     assert {row.verdict for row in rows.values()} == {"agrees"}
-    values = palida_base.measure_structure(1, {}).values
+    values = palida_base.compare_base_parameter_methods(1, {}).values
     # independent of Table 1: 13 parameters per leg and 10 of the platform, for any bodies
     assert values["rank, 19 bodies"] == values["rules, 19 bodies"] == 6 * 13 + 10
 
@@ -84,7 +84,7 @@ def test_moved_frame_leaves_the_kinetic_energy():
     rotation *= np.sign(np.linalg.det(rotation))
     offset, spin, speed = rng.normal(size=(3, 3))
     body = np.array([2.0, 0.3, -0.2, 0.5, 1.0, 0.1, -0.2, 1.5, 0.05, 1.2])
-    carrier = palida_base.transfer_parameters(rotation, offset) @ body
+    carrier = palida_base.compute_inertial_transformation(rotation, offset) @ body
 
     def energy(parameters, spin, speed):
         tensor = palida_base._build_inertia_tensor(parameters[4:])
@@ -112,14 +112,14 @@ def test_dry_friction_is_merged_where_hinges_are_equal(scatter, left):
 
     One data set: a parameter without effect stays in one of twenty, by the 5 % of the test.
     """
-    values = study.measure_reduction(1, {"hinge_scatter": scatter}).values
+    values = study.measure_friction_reduction(1, {"hinge_scatter": scatter}).values
     assert values["stop"] in (left, left + 1)
     assert scatter == 0.0 or not values["reached"]
 
 
 @pytest.mark.nightly
 def test_frequency_domain_predicts_best_and_time_domain_better_than_raw():
-    sample = processing.measure_processing(1, {})
+    sample = processing.compare_processing_methods(1, {})
     variances = [sample.values[f"{way} true variance"] for way in processing.METHOD_NAMES]
     assert variances[0] > variances[1] > variances[2]
     assert sample.values["periodic 2"] < processing.MAX_VISIBLE_ERROR
@@ -131,7 +131,7 @@ def test_frequency_domain_predicts_best_and_time_domain_better_than_raw():
 def test_too_wide_window_is_found():
     cycle = simulate_excitation()
     record = simulate_measurement(cycle, 2, np.random.default_rng(1))
-    motion = processing.process_lengths(record, cycle.period, "periodic", 200)
+    motion = processing.compute_motion_from_lengths(record, cycle.period, "periodic", 200)
     error = motion[2, : len(cycle.force), processing.Y_AXIS] - cycle.motion[2, :, processing.Y_AXIS]
     assert np.std(error) > processing.MAX_VISIBLE_ERROR * np.std(cycle.motion[2, :, 1])
 
@@ -144,7 +144,7 @@ def test_normal_equations_give_the_gauss_markov_estimate():
     equations = trials.NormalEquations(matrix)
     weight = np.linalg.inv(covariance)[None]
     value, information = equations.solve(weight, equations.correlate(force)[None])
-    expected = estimate(matrix, force, covariance, order=0)
+    expected = estimate_linear_parameters(matrix, force, covariance, order=0)
     # condition of the normal equations, about 1e7, times rounding
     np.testing.assert_allclose(value[0], expected.value, rtol=1e-7)
     white = np.linalg.inv(np.linalg.cholesky(covariance)) @ matrix
@@ -157,7 +157,7 @@ def test_normal_equations_give_the_gauss_markov_estimate():
 def test_distances_of_the_trials_have_their_distribution():
     settings = trials.TRIAL_SETTINGS | {"friction_excess": 0.0, "trials": 60}
     found = trials.simulate_trials(1, settings)
-    distance = trials.compute_square_distance(found.value - load_robot().truth, found.information)
+    distance = trials.compute_squared_mahalanobis(found.value - load_robot().truth, found.information)
     total = float(distance.sum())  # chi^2 with 24 degrees of freedom per trial
     assert 1e-3 < chi2.sf(total, 24 * 60) < 1.0 - 1e-3
     assert abs(chi2.ppf(0.95, 24) - CHI2_LIMIT) < 0.005  # two printed decimals
@@ -165,11 +165,11 @@ def test_distances_of_the_trials_have_their_distribution():
 
 @pytest.mark.nightly
 def test_only_friction_that_warms_up_brings_the_first_trial_out():
-    cold = trials.measure_trials(1, {"trials": 30}).values
+    cold = trials.compute_trial_statistics(1, {"trials": 30}).values
     assert cold["first distance"] > CHI2_LIMIT > 0.0
     # the same noise and warm friction: a chi^2 variable, of which 1 of 1000 exceeds 51.2
     assert cold["warm first distance"] < 51.2
-    warm = trials.measure_trials(1, {"trials": 30, "friction_excess": 0.0}).values
+    warm = trials.compute_trial_statistics(1, {"trials": 30, "friction_excess": 0.0}).values
     # the mean of the other 29 trials differs by what is left of the excess in the second
     assert warm["first distance"] == pytest.approx(cold["warm first distance"], rel=0.2)
 
@@ -198,7 +198,7 @@ def test_bias_is_found_where_it_is_and_not_where_it_is_not():
 
 @pytest.mark.nightly
 def test_encoder_noise_that_controllers_pass_on_biases_samples_but_not_periods():
-    arrays = trials.measure_encoder_feedback(1, {}).arrays
+    arrays = trials.measure_bias_by_encoder_feedback(1, {}).arrays
     rms = {name: float(np.sqrt(np.mean(error**2))) for name, error in arrays.items()}
     assert rms["samples, least squares"] > 10.0 < rms["samples, Gauss-Markov"]
     # two periods instead of four, and forces with the controllers' noise

@@ -19,17 +19,17 @@ from hydrotele.experiments.comparison import (
     Panel,
     Sample,
     Series,
-    compare_by_seeds,
+    compare_by_repetition_count,
     run_series,
     run_with_faults,
     summarize_verdicts,
 )
 from hydrotele.experiments.intervals import (
-    check_exact,
+    check_bootstrapped_statistic,
+    check_deterministic_value,
     check_fraction,
     check_mean,
-    check_population,
-    check_statistic,
+    check_published_in_population,
     collect_values,
     format_values,
 )
@@ -49,7 +49,7 @@ def test_quantity_that_is_not_a_number_differs():
 
 
 def test_judgement_needs_all_checks():
-    good, bad = check_exact("a", 1.0, (0.0, 2.0), ""), check_exact("b", 3.0, (0.0, 2.0), "")
+    good, bad = check_deterministic_value("a", 1.0, (0.0, 2.0), ""), check_deterministic_value("b", 3.0, (0.0, 2.0), "")
     open_ = check_mean("c", np.array([1.0]), (0.0, 2.0), "")
     assert Evaluation((good, good)).verdict == "agrees"
     assert Evaluation((good, bad, open_)).verdict == "differs"
@@ -72,7 +72,7 @@ def test_intervals_cover_the_truth():
         check = check_mean("", pair[:, 0], (0, 1), "")
         mean.append(check.low <= 2.0 <= check.high)
         if number < 40:
-            check = check_statistic("", pair, lambda x: x[:, 0].mean() / x[:, 1].mean(), (0, 1), "")
+            check = check_bootstrapped_statistic("", pair, lambda x: x[:, 0].mean() / x[:, 1].mean(), (0, 1), "")
             ratio.append(check.low <= 2.0 <= check.high)
         check = check_fraction("", rng.random(20) < 0.7)
         fraction.append(check.low <= 0.7 <= check.high)
@@ -83,8 +83,8 @@ def test_intervals_cover_the_truth():
 
 def test_published_figure_is_compared_with_the_population():
     sizes = np.exp(np.random.default_rng(2).normal(0.0, 0.3, 40))
-    assert check_population("size", sizes, 1.1).verdict == "agrees"
-    assert check_population("size", sizes, 11.0).verdict == "differs"
+    assert check_published_in_population("size", sizes, 1.1).verdict == "agrees"
+    assert check_published_in_population("size", sizes, 11.0).verdict == "differs"
 
 
 def test_failures_of_a_broken_run_are_decided():
@@ -109,7 +109,7 @@ def judge_length(samples):
 
 CLAIM = Claim("length", "2 m", "p. 1, Table 1", "document", judge_length, {"error": 3.0}, "3 m longer")
 INPUT = Claim("mass", "3 kg", "p. 2, Table 2", "input",
-              lambda samples: Evaluation((check_exact("mass", 3.0, (2.9, 3.1), "digits"),)),
+              lambda samples: Evaluation((check_deterministic_value("mass", 3.0, (2.9, 3.1), "digits"),)),
               {"error": 1.0}, "")  # fmt: skip
 SERIES = Series(
     "wang2012", "A. Author, 2000", 8,
@@ -125,7 +125,7 @@ def test_series_is_judged_and_can_be_broken():
     assert summarize_verdicts(rows).startswith("of 2 published results 1 agree, 0 differ")
     ((claim, broken),) = run_with_faults(SERIES, ["length"], jobs=1)
     assert claim is CLAIM and broken.verdict == "differs"
-    counts = compare_by_seeds(SERIES, (1, 8), jobs=1)
+    counts = compare_by_repetition_count(SERIES, (1, 8), jobs=1)
     assert [counts[n][0].verdict for n in (1, 8)] == ["undecided", "agrees"]
     assert counts[8][0] == rows[0]._replace(panels=counts[8][0].panels)
 
@@ -137,7 +137,7 @@ def test_processes_give_the_same_samples():
 
 
 def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
-    monkeypatch.setattr(experimenting, "load_series", lambda name: SERIES)
+    monkeypatch.setattr(experimenting, "load_experiment_series", lambda name: SERIES)
     folder = tmp_path / "results"
     asked = ["experiments", "wang2012", "--jobs", "1", "--out", str(folder)]
     result = CliRunner().invoke(app, asked)
@@ -157,9 +157,9 @@ def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
 
 
 def test_a_difference_is_the_exit_status(monkeypatch):
-    check = check_exact("length", 2.0, (2.9, 3.1), "")
+    check = check_deterministic_value("length", 2.0, (2.9, 3.1), "")
     long = Claim("length", "3 m", "p. 1", "document", lambda samples: Evaluation((check,)))
-    monkeypatch.setattr(experimenting, "load_series", lambda name: Series(
+    monkeypatch.setattr(experimenting, "load_experiment_series", lambda name: Series(
         "wang2012", "", 1, (Experiment("lengths", measure_length, (long,)),)))  # fmt: skip
     result = CliRunner().invoke(app, ["experiments", "wang2012", "--json", "--jobs", "1"])
     assert result.exit_code == 1

@@ -19,12 +19,12 @@ from hydrotele.experiments.khoshzaban_arm import (
     identify_with_disturbance,
     measure_exact_readings,
 )
-from hydrotele.experiments.khoshzaban_calibration import measure_bend_detection, measure_calibration
+from hydrotele.experiments.khoshzaban_calibration import measure_bend_detection, measure_calibration_errors
 from hydrotele.experiments.khoshzaban_experiment import (
-    compute_accepted_change,
-    measure_printed_parameters,
+    compute_accepted_ratio_range,
+    measure_printed_end_point_errors,
 )
-from hydrotele.experiments.khoshzaban_machine import measure_identifiable_lists, measure_machine
+from hydrotele.experiments.khoshzaban_machine import find_identifiable_parameters, read_machine_dimensions
 
 ROWS = {
     "Table 1": "masses of the links",
@@ -81,24 +81,24 @@ def test_every_claim_with_a_verdict_can_be_broken():
 
 
 def test_dimensions_agree_and_other_dimensions_differ():
-    sample = measure_machine(1, {})
+    sample = read_machine_dimensions(1, {})
     for claim in khoshzaban_machine.EXPERIMENTS[0].claims:
         assert claim.kind == "input"
         assert claim.compare([sample]).verdict == "agrees", claim.compare([sample]).simulated
-        broken = claim.compare([measure_machine(1, claim.fault or {})])
+        broken = claim.compare([read_machine_dimensions(1, claim.fault or {})])
         assert broken.verdict == "differs", broken.simulated
 
 
 @pytest.mark.nightly
 def test_identifiable_lists_are_those_of_the_document():
     claim = khoshzaban_machine.EXPERIMENTS[1].claims[0]
-    assert claim.compare([measure_identifiable_lists(1, {})]).verdict == "agrees"
-    assert claim.compare([measure_identifiable_lists(1, claim.fault or {})]).verdict == "differs"
+    assert claim.compare([find_identifiable_parameters(1, {})]).verdict == "agrees"
+    assert claim.compare([find_identifiable_parameters(1, claim.fault or {})]).verdict == "differs"
 
 
 @pytest.mark.parametrize("measure", [
-    khoshzaban_arm.measure_simulations, khoshzaban_arm.measure_initial_estimates, measure_exact_readings,
-    measure_calibration, measure_bend_detection, measure_printed_parameters, measure_identifiable_lists,
+    khoshzaban_arm.measure_disturbance_effects, khoshzaban_arm.compare_initial_estimates, measure_exact_readings,
+    measure_calibration_errors, measure_bend_detection, measure_printed_end_point_errors, find_identifiable_parameters,
 ])  # fmt: skip
 def test_unknown_settings_are_refused(measure):
     with pytest.raises(InputError, match="setting moon"):
@@ -107,7 +107,7 @@ def test_unknown_settings_are_refused(measure):
 
 def test_printed_parameters_give_some_of_the_printed_position_errors():
     """Table 7, stick 0.212 m (p. 66): 0.213 m; Table 9, stick 0.153 m (p. 71): not near."""
-    values = measure_printed_parameters(1, {}).values
+    values = measure_printed_end_point_errors(1, {}).values
     assert values["identified.manipulator.stick"] == pytest.approx(0.212, abs=0.002)
     assert values["reidentified.manipulator.stick"] > 0.25
     for model in ("identified", "reidentified"):  # p. 67: 0.000 m, whatever is identified
@@ -151,8 +151,8 @@ def test_iterations_have_to_grow_as_much_as_published():
 
 
 def test_changed_range_needs_half_of_the_published_decrease():
-    assert compute_accepted_change(0.8) == pytest.approx((0.6, 0.9))
-    assert compute_accepted_change(0.2)[0] == 0.0
+    assert compute_accepted_ratio_range(0.8) == pytest.approx((0.6, 0.9))
+    assert compute_accepted_ratio_range(0.2)[0] == 0.0
 
 
 def test_drift_alone_leaves_errors_of_the_published_size():
@@ -168,11 +168,11 @@ def test_drift_alone_leaves_errors_of_the_published_size():
 @pytest.mark.nightly
 def test_bent_joints_are_left_out_and_leave_smaller_errors():
     """Bends of 4 deg: without these poses the stick's twists are right to the sensors' noise."""
-    values = measure_calibration(1, {"poses": 0.4, "bend": (4.0, 4.0)}).values
+    values = measure_calibration_errors(1, {"poses": 0.4, "bend": (4.0, 4.0)}).values
     assert values["inside.6"] > 10.0 * values["outside.6"]
     before, after = (abs(values[f"{m}.error.alpha.stick"]) for m in ("identified", "reidentified"))
     assert before > np.radians(1.0) > after
     claims = {claim.name: claim for claim in khoshzaban_experiment.EXPERIMENTS[1].claims}
-    labels = {panel.label for panel in measure_calibration(1, {"poses": 0.1}).panels}
+    labels = {panel.label for panel in measure_calibration_errors(1, {"poses": 0.1}).panels}
     for claim in claims.values():
         assert set(claim.panel_labels or ()) <= labels, claim.name

@@ -22,15 +22,15 @@ from hydrotele.experiments.khoshzaban_dynamics import (
     UNAVAILABLE,
 )
 from hydrotele.experiments.khoshzaban_models import (
-    draw_motion,
-    draw_states,
-    find_base,
-    make_document_setup,
+    find_base_parameters,
     make_regressor,
+    make_thesis_regressor_setup,
+    sample_motion,
+    sample_states,
     stack_rows,
 )
 from hydrotele.identify.identifiability import classify_parameters
-from hydrotele.multibody.tree_motion import compute_frames, compute_wrenches, make_frames
+from hydrotele.multibody.tree_motion import allocate_frames, compute_frames, compute_unit_wrenches
 
 BODIES = ("swing", "boom", "stick", "stick_tube", "stick_rod", "boom_tube", "boom_rod")
 
@@ -57,14 +57,14 @@ class Recursion:
         self.axis = np.empty((n, len(chain.joints), 3))
         self.force = {b: np.zeros((n, 3, 70)) for b in BODIES}
         self.torque = {b: np.zeros((n, 3, 70)) for b in BODIES}
-        frames, one, two = make_frames(tree), np.empty((3, 10)), np.empty((3, 10))
+        frames, one, two = allocate_frames(tree), np.empty((3, 10)), np.empty((3, 10))
         for row in range(n):
             motion = (found.position[row], found.rate[row], found.acceleration[row])
             compute_frames(tree, *motion, still, frames)
             self.axis[row] = frames.axis
             for k, body in enumerate(BODIES):
                 b = chain.bodies.index(body) + 1
-                compute_wrenches(frames, b, one, two)
+                compute_unit_wrenches(frames, b, one, two)
                 own = slice(10 * k, 10 * k + 10)
                 self.place[body][row], self.x_axis[body][row] = (
                     frames.origin[b],
@@ -120,8 +120,8 @@ class Recursion:
 
 @pytest.mark.parametrize("ball_joints", [True, False])
 def test_the_regressor_is_that_of_the_documents_recursion(ball_joints):
-    setup = make_document_setup("complete", ball_joints)
-    found = setup.project(*draw_states(60))
+    setup = make_thesis_regressor_setup("complete", ball_joints)
+    found = setup.project_motion_on_drives(*sample_states(60))
     table = setup.compute_regressor(found)
     places = [table.names.index(f"{n}.{b}") for b in BODIES for n in _PARAMETERS]
     by_recursion = Recursion(setup, found, axial_moment=not ball_joints).drives()
@@ -144,7 +144,7 @@ _PARAMETERS = ("mass", "moment_x", "moment_y", "moment_z", "inertia_xx", "inerti
 @pytest.mark.parametrize("seed", [1, 2])
 def test_counts_do_not_depend_on_the_states(seed):
     for ball_joints, rank, full in ((True, 51, 27), (False, 45, 20)):
-        table = make_regressor(make_document_setup("complete", ball_joints), draw_states(200, seed))
+        table = make_regressor(make_thesis_regressor_setup("complete", ball_joints), sample_states(200, seed))
         told = classify_parameters(stack_rows(table), table.names, table.units)
         assert (len(told.base), told.status_counts["full"]) == (rank, full)
         assert told.singular_value_gap[0] > 1e6 * told.singular_value_gap[1]
@@ -152,7 +152,7 @@ def test_counts_do_not_depend_on_the_states(seed):
 
 def test_motions_fit_the_axes_of_the_figures():
     for seed in range(20):
-        position, rate, acceleration = draw_motion(np.random.default_rng(seed))
+        position, rate, acceleration = sample_motion(np.random.default_rng(seed))
         degrees = np.rad2deg(position)
         assert np.all(degrees >= [-40, 0, -150]) and np.all(degrees <= [20, 50, 0])
         assert np.all(np.abs(rate).max(axis=0) <= [0.4, 0.4, 1.5])
@@ -165,8 +165,8 @@ def test_motions_fit_the_axes_of_the_figures():
 
 def test_parameters_come_back_from_forces_without_errors():
     for model in ("complete", "reduced"):
-        base = find_base(model)
-        states = draw_states(200, 5)
+        base = find_base_parameters(model)
+        states = sample_states(200, 5)
         table = make_regressor(base.setup, states)
         found = base.estimate(states, table.matrix @ table.nominal)
         # rounding times the condition of some 1e4

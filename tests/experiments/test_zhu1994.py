@@ -116,7 +116,7 @@ def test_centring_force_is_a_line_and_detents_are_not():
     rows = SERIES.claims["conventional centring force"], SERIES.claims["detents"]
     assert rows[0].fault == {"pilot.detent": "true"} and rows[1].fault == {"pilot.detent": "false"}
     for detent, verdicts in (("false", ("agrees", "differs")), ("true", ("differs", "undecided"))):
-        samples = [zhu_motion.measure_handle_ramp(detent, seed, {}) for seed in (1, 2, 3)]
+        samples = [zhu_motion.measure_handle_force_curve(detent, seed, {}) for seed in (1, 2, 3)]
         assert tuple(row.compare(samples).verdict for row in rows) == verdicts
 
 
@@ -196,7 +196,7 @@ def test_contact_with_the_stem_precedes_the_saw():
 
 def test_head_presses_on_the_stem_and_not_on_the_stump():
     """0.5 kN on the stem before the saw starts at 16 s; seed 2 does not touch the stump."""
-    values = zhu_felling.measure_felling(2, {"duration": "14.0"}).values
+    values = zhu_felling.simulate_tree_felling(2, {"duration": "14.0"}).values
     assert values["touched"] < 14.0 < values["saw"]
     assert values["stem"] > 500.0 and values["stump"] == 0.0
     assert values["stiffness_change"] > zhu_felling.JUST_NOTICEABLE_DIFFERENCE

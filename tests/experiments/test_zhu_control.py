@@ -9,7 +9,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import zhu_control, zhu_identification
 from hydrotele.experiments.comparison import merge_settings
-from hydrotele.experiments.zhu_identification import fail_sensors, measure_outliers
+from hydrotele.experiments.zhu_identification import measure_outliers, simulate_sensor_failures
 from hydrotele.logs.log import Log
 
 EXPERIMENTS = (*zhu_control.EXPERIMENTS, *zhu_identification.EXPERIMENTS)
@@ -102,7 +102,7 @@ def test_failed_sensors_read_zero_for_a_while():
     names = [f"{k}.boom" for k in ("angle", "pressure_head", "pressure_rod")]
     units = {name: "rad" if "angle" in name else "Pa" for name in names}
     log = Log(time, {name: np.ones(3000) for name in names}, units)
-    bad = fail_sensors(log, ("boom",), 4, np.random.default_rng(0))
+    bad = simulate_sensor_failures(log, ("boom",), 4, np.random.default_rng(0))
     dead = sum(np.count_nonzero(bad[name] == 0.0) for name in names) * 0.02
     assert 0.5 < dead < 12.0
     assert all(np.all(log[name] == 1.0) for name in names)

@@ -21,7 +21,7 @@ from hydrotele.gap.result import (
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 from hydrotele.terms.law import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}
@@ -43,7 +43,7 @@ def made_up_log(rows: int = _ROWS) -> Log:
     for name in columns:
         if not name.startswith("command"):
             columns[name] = columns[name] + NOISE[name.split(".")[0]] * rng.normal(size=rows)
-    units = {name: default_unit(name) for name in columns}
+    units = {name: default_channel_unit(name) for name in columns}
     return Log(time, columns, units, {"machine": "cat215", "tool": "none"}, "data/test_1.parquet")
 
 

@@ -20,9 +20,9 @@ from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
 from hydrotele.gap.law_tables import Table, lack_regression
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
-from hydrotele.machine.machine import SensorError, get_sensors, noise_rms
+from hydrotele.machine.machine import SensorError, get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.terms.law import Term
 from tests.estimate.test_filter import machine_data
@@ -52,12 +52,12 @@ def recorded(machine, seconds=20.0, seed=0):
         error = (wanted - z[:free]) * np.where(np.arange(free) > 1, -1, 1)  # stick: out = angle up
         command[row] = np.clip(0.05 * np.tanh(200 * error) + 4 * error, -1, 1)
         advance(model, space, z, command, row, PERIOD, steps, trail)
-    rng, sensors = np.random.default_rng(seed), get_sensors(machine, SENSORS)
+    rng, sensors = np.random.default_rng(seed), get_sensor_set(machine, SENSORS)
     columns = {f"command.{axis}": command[:, i] for i, axis in enumerate(plant.axes)}
     for i, name in enumerate(channels):
-        bound = np.sqrt(3) * noise_rms(machine, sensors, name)
+        bound = np.sqrt(3) * reading_noise_rms(machine, sensors, name)
         columns[name] = out[:, i] + rng.uniform(-bound, bound, rows)
-    units = {name: default_unit(name) for name in columns}
+    units = {name: default_channel_unit(name) for name in columns}
     return Log(PERIOD * np.arange(rows), columns, units)
 
 

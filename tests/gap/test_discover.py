@@ -40,7 +40,7 @@ from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.law import Drives, DriveState, Term
-from hydrotele.terms.table import FORCE, PLAY, SWITCH, sum_terms, terms_table, update_term_state
+from hydrotele.terms.table import FORCE, PLAY, SWITCH, encode_terms_table, sum_terms, update_term_state
 from tests.estimate.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 7.0
@@ -162,7 +162,7 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
         table = Table(*table)
         entries = rng.normal(size=table.size)
         term = Term(name="law", axis="boom", balance="force", **table.law(entries))
-        written = terms_table([term], order, areas={"stick": (1.0, 0.5)})
+        written = encode_terms_table([term], order, areas={"stick": (1.0, 0.5)})
         columns = table.columns(made_up)
         assert columns.shape == (400, table.size)
         for row in rng.integers(400, size=20):
@@ -212,7 +212,7 @@ def test_every_table_with_a_memory_is_such_a_term():
     for table in [t for k, t in enumerate(tables) if k % 3 == 0]:
         entries = rng.normal(size=table.size)
         term = Term(name="law", axis="boom", balance="force", **table.law(entries))
-        written, held = terms_table([term], order, 12), 0.0
+        written, held = encode_terms_table([term], order, 12), 0.0
         columns, told = table.columns(values), []
         for row in range(400):
             now = {name: column[row] for name, column in values.items()}

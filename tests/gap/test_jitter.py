@@ -13,7 +13,7 @@ from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import Log, save_log
-from hydrotele.machine.machine import get_sensors, noise_rms
+from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
@@ -39,7 +39,7 @@ def dataset(truth, machine, folder, jitter: float):
                 continue
             columns[name] = truth[name]
             if not name.startswith("command."):
-                sigma = noise_rms(machine, get_sensors(machine, SITE), name)
+                sigma = reading_noise_rms(machine, get_sensor_set(machine, SITE), name)
                 shown = CubicSpline(truth.time, truth[name])(at)
                 columns[name] = shown + sigma * rng.normal(size=len(at))
         units = {name: truth.units[name] for name in columns}
@@ -104,7 +104,7 @@ def test_jitter_that_another_lack_hides_is_found_with_it(truth, tmp_path):
 
 def test_a_logger_that_jitters_reads_all_channels_at_its_own_instants():
     machine = load_machine("cat215")
-    sensors = get_sensors(machine, SITE)
+    sensors = get_sensor_set(machine, SITE)
     assert sensors
     plain = type(sensors)(jitter=0.004)
     ramp = np.linspace(0.0, 2.0, 201)  # 1 unit/s

@@ -12,8 +12,8 @@ import pytest
 from hydrotele.show import gap_report
 from hydrotele.show.gap_recording import (
     channel_rms,
-    gap_windows,
-    most_changed_channels,
+    find_gap_windows,
+    find_most_improved_channels,
     windowed_errors,
 )
 from hydrotele.show.gap_report import write_report
@@ -58,7 +58,7 @@ def page_of(tmp_path_factory, gap_of):
         path = folder / "report.html"
         with pytest.MonkeyPatch.context() as patched:
             if not rastered:
-                patched.setattr(gap_report, "png", lambda figure: b"")
+                patched.setattr(gap_report, "figure_to_png", lambda figure: b"")
             write_report(dataclasses.replace(gap_of(verdict), **changes), path)
         return _Page(path.read_text(encoding="utf-8")), path.read_text(encoding="utf-8")
 
@@ -167,8 +167,8 @@ def test_windows_find_what_is_planted(gap_of):
     found = windowed_errors(before)
     total = np.nansum(found.rms**2 * found.count)
     assert total == pytest.approx(np.nansum(before.whitened**2), rel=1e-12)  # rounding
-    loud = gap_windows(before, 1.0)
+    loud = find_gap_windows(before, 1.0)
     # six deviations are added from 3.0 to 4.6 s with a wave that is loud all through
     assert any(w.start <= 3.0 and w.stop >= 4.6 and w.channel.endswith(".boom") for w in loud)
-    assert gap_windows(after, 1.0) == []
-    assert {name.partition(".")[2] for name in most_changed_channels(before, after, 4)} == {"boom"}
+    assert find_gap_windows(after, 1.0) == []
+    assert {name.partition(".")[2] for name in find_most_improved_channels(before, after, 4)} == {"boom"}

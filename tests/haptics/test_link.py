@@ -19,7 +19,7 @@ from hydrotele.haptics.link import (
     MALFORMED,
     SERVER_STARTS,
     HapticLink,
-    answer_pose,
+    answer_pose_packet,
     scale_pose,
 )
 from hydrotele.haptics.packets import (
@@ -34,7 +34,7 @@ from hydrotele.haptics.packets import (
     TRAVEL,
     WRENCH,
 )
-from hydrotele.haptics.server import run_server
+from hydrotele.haptics.server import run_device_server
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.teleop.axis_table import HANDLE_RANGE, NOMINAL_STIFFNESS
@@ -82,7 +82,7 @@ class Stand:
         real[TRAVEL : PERIOD + 1], real[CAN_APPLY_FORCE] = (0.05, 0.5, 12.0, 0.4, STEP), 1.0
         for name, value in changes.items():
             (real if name in ("CAN_APPLY_FORCE", "PLACE") else whole)[getattr(packets, name)] = value
-        answered = answer_pose(line, self.link.mailbox, self.now, self.two)
+        answered = answer_pose_packet(line, self.link.mailbox, self.now, self.two)
         self.now, self.sequence = self.now + MS, self.sequence + 1
         return answered
 
@@ -224,7 +224,9 @@ def test_device_and_machine_on_the_loopback(numbers):
         motion_frequencies=(0.25,) * 6,
     )
     device, over, where = SimulatedDevice(STEP, facts), threading.Event(), []
-    server = threading.Thread(target=run_server, args=(device, ("127.0.0.1", 0), STEP, over.is_set, where.append))
+    server = threading.Thread(
+        target=run_device_server, args=(device, ("127.0.0.1", 0), STEP, over.is_set, where.append)
+    )
     server.start()
     until(lambda: where)
     link, qpos = HapticLink(*where[0]), np.zeros(7)

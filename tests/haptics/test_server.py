@@ -43,7 +43,7 @@ class Stand:
 
     def period(self):
         self.now += MS
-        self.exchange.update_pose(self.now)
+        self.exchange.apply_wrench_and_read_pose(self.now)
         return self.exchange.pose
 
     def send(self, force=(0.0,) * 6, sender=HERE, **changes):

@@ -6,14 +6,14 @@ import os
 import numpy as np
 import pytest
 
-from hydrotele.cli.haptic import describe_computer
+from hydrotele.cli.haptic import describe_computer_timing
 from hydrotele.haptics import timing
 from hydrotele.haptics.timing import (
     HISTOGRAM_EDGES_US,
     RealTimePacer,
-    measure_idle_deadlines,
+    measure_missed_deadlines,
     read_steal_time,
-    reduced_jitter,
+    reduce_timing_jitter,
     summarise_durations,
 )
 
@@ -84,8 +84,8 @@ def test_a_loop_without_work_counts_what_the_computer_takes(clock):
         calls[0] += 1
         usual(seconds + (3e-3 if calls[0] % 100 == 0 else 0.0))
 
-    assert measure_idle_deadlines(2.0, 1000.0, now=clock.now, sleep=usual)["missed"] == 0
-    found = measure_idle_deadlines(2.0, 1000.0, now=clock.now, sleep=stalled)
+    assert measure_missed_deadlines(2.0, 1000.0, now=clock.now, sleep=usual)["missed"] == 0
+    found = measure_missed_deadlines(2.0, 1000.0, now=clock.now, sleep=stalled)
     assert found["ticks"] == 2000 and found["missed"] == 2 * (calls[0] // 100) > 30
     # 3 ms after the 0.12 ms before a deadline in which it stays awake, and a tick of 1 ms later
     assert found["lateness"]["percentiles_us"]["max"] == pytest.approx(1880.0, abs=2.0)
@@ -108,18 +108,18 @@ def test_stolen_time_is_the_kernels(tmp_path):
 def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
     computer = {"seconds": 10.0, "ticks": 10000, "missed": alone,
                 "lateness": summarise_durations(np.full(alone, 2_000_000))}  # fmt: skip
-    found = describe_computer({"ticks": 10000, "missed": own}, computer)
+    found = describe_computer_timing({"ticks": 10000, "missed": own}, computer)
     assert len(found) == len(said)
     for sentence, words in zip(found, said, strict=True):
         assert words in sentence
-    stolen = describe_computer({"ticks": 1, "missed": 0},
+    stolen = describe_computer_timing({"ticks": 1, "missed": 0},
                                 {"stolen_seconds": 0.4, "stolen_share": 0.02})  # fmt: skip
     assert stolen == ["processor time taken by the host: 0.4 s, 2 % of all cores"]
 
 
 def test_garbage_is_collected_again_afterwards():
     assert gc.isenabled()
-    with reduced_jitter(0) as priority:
+    with reduce_timing_jitter(0) as priority:
         assert not gc.isenabled() and not priority
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
@@ -128,7 +128,7 @@ def test_idle_processors_are_kept_awake_meanwhile(tmp_path, monkeypatch):
     wake = tmp_path / "wake"
     wake.touch()
     monkeypatch.setattr(timing, "_WAKE_LATENCY_FILE", wake)
-    with reduced_jitter(0):
+    with reduce_timing_jitter(0):
         assert wake.read_bytes() == bytes(4)  # 0 us, as an int32
         held = {os.path.realpath(f"/proc/self/fd/{n}") for n in os.listdir("/proc/self/fd")}
         assert str(wake.resolve()) in held  # the kernel forgets the wish when it is closed
@@ -138,7 +138,7 @@ def test_idle_processors_are_kept_awake_meanwhile(tmp_path, monkeypatch):
 
 def test_a_system_that_keeps_none_awake_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_WAKE_LATENCY_FILE", tmp_path / "wake")
-    with reduced_jitter(0):
+    with reduce_timing_jitter(0):
         assert not gc.isenabled()
     assert gc.isenabled() and not (tmp_path / "wake").exists()
 

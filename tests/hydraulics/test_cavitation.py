@@ -10,16 +10,16 @@ from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SLOT_COUNT,
     Slot,
-    axis_opening,
+    axis_valve_opening,
+    chamber_pressure_rates,
     circuit_scratch,
-    pressure_rates,
     step_circuit,
 )
 from hydrotele.hydraulics.laws import (
     ATMOSPHERE,
     air_softening_factor,
-    pressure_with_air,
-    pressure_without_air,
+    pressure_with_released_air,
+    pressure_without_released_air,
 )
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
@@ -181,15 +181,15 @@ def test_a_machine_above_atmosphere_knows_nothing_of_its_air(boom):
 def test_with_and_without_air_are_inverse_over_all_that_a_chamber_may_lack():
     for oil in -np.geomspace(1e-3, 1e11, 60):
         for release in (1e5, 8.1e7, 5e9):
-            felt = pressure_with_air(oil, release)
+            felt = pressure_with_released_air(oil, release)
             assert -ATMOSPHERE < felt < 0.0
-            assert pressure_without_air(felt, release) == pytest.approx(oil, rel=1e-6)
+            assert pressure_without_released_air(felt, release) == pytest.approx(oil, rel=1e-6)
 
 
 def test_what_is_said_to_be_below_vacuum_is_nearly_empty_and_nothing_worse(boom):
     """Readings and states of other programs may be anything; none may turn into a pressure wave."""
     for start in (-ATMOSPHERE, -120e3, -2.9e6):
-        assert pressure_without_air(start, 8.1e7) < -ATMOSPHERE
+        assert pressure_without_released_air(start, 8.1e7) < -ATMOSPHERE
         states = run(boom, lambda _: (0.5, 0.0), 1e-3, 0.2, start=(start, 1.0e6))
         assert np.isfinite(states).all()
         assert states[1:].max() < 1.1e6
@@ -218,10 +218,10 @@ def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
 
 
 def test_a_balance_of_readings_misses_no_oil_where_a_chamber_gives_off_air(boom):
-    """Readings of a chamber below atmosphere, whose true rates `pressure_rates` has."""
+    """Readings of a chamber below atmosphere, whose true rates `chamber_pressure_rates` has."""
     pressures, x, v, spool = np.array([-6.0e4, 2.0e6]), 0.5, 0.3, 0.2
-    numbers = (boom, 0, axis_opening(boom, 0, spool), 20.0e6, *pressures, x, v, 0.0, (0.0,) * 4)
-    oil = np.array(pressure_rates(*numbers)[:2])
+    numbers = (boom, 0, axis_valve_opening(boom, 0, spool), 20.0e6, *pressures, x, v, 0.0, (0.0,) * 4)
+    oil = np.array(chamber_pressure_rates(*numbers)[:2])
     soft = np.array([air_softening_factor(p, boom[Slot.AIR_RELEASE]) for p in pressures])
     assert soft[0] < 1e-3 and soft[1] == 1.0
     volumes = np.array([

@@ -12,11 +12,11 @@ from hydrotele.hydraulics.circuit import (
     _relief_limited_rate,
     axis_flows_and_force,
     circuit_scratch,
-    compute_ports,
+    compute_inlet_conditions,
+    solve_supply_pressure,
     step_circuit,
-    supply_pressure,
 )
-from hydrotele.hydraulics.laws import port_flow
+from hydrotele.hydraulics.laws import relief_and_makeup_flow
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import Drives
@@ -142,13 +142,13 @@ def test_one_axis_alone_agrees_with_the_independent_integration(user):
 def flows(user, state, x, v):
     """Supply flows and, per chamber of every axis, all oil that enters, [m^3/s]."""
     ports, fed, net = np.zeros(12), 0.0, []
-    compute_ports(user, state, state, ports, 0, 3, 0.0, state)
-    p_s = supply_pressure(ports, 3, SMOOTHING, RELIEF, PUMP)
+    compute_inlet_conditions(user, state, state, ports, 0, 3, 0.0, state)
+    p_s = solve_supply_pressure(ports, 3, SMOOTHING, RELIEF, PUMP)
     for i in range(3):
         row, act = user[i * SLOT_COUNT : (i + 1) * SLOT_COUNT], state[4 * i : 4 * i + 4]
         q_a, q_b, _ = axis_flows_and_force(user, i, p_s, act, x[i], v[i])
         leak = LEAK * (act[2] - act[3])
-        r_a, r_b = (port_flow(p, PORT, K_RELIEF, TANK, K_MAKEUP)[0] for p in act[2:])
+        r_a, r_b = (relief_and_makeup_flow(p, PORT, K_RELIEF, TANK, K_MAKEUP)[0] for p in act[2:])
         fed += max(q_a, 0) + max(q_b, 0)
         net += [q_a - row[Slot.AREA_HEAD] * v[i] - leak + r_a,
                 q_b + row[Slot.AREA_ROD] * v[i] + leak + r_b]  # fmt: skip

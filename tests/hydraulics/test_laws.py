@@ -16,7 +16,7 @@ from hydrotele.hydraulics import laws as hydraulics
 from hydrotele.hydraulics.laws import (
     friction_force,
     orifice_flow,
-    port_flow,
+    relief_and_makeup_flow,
     spool_step,
     valve_opening,
 )
@@ -108,19 +108,22 @@ def test_orifice_passes_the_rated_flow_at_the_rated_drop():
 
 @given(st.floats(-5e6, 40e6))
 def test_port_flow_drives_the_pressure_back_into_the_band(pressure):
-    flow, slope = port_flow(pressure, *PORT)
+    flow, slope = relief_and_makeup_flow(pressure, *PORT)
     relief, k_relief, tank, k_makeup = PORT
     expected = -k_relief * max(0.0, pressure - relief) + k_makeup * max(0.0, tank - pressure)
     assert flow == expected
     step = 1.0  # Pa: the law is linear on both sides, so the difference quotient is exact
     if min(abs(pressure - relief), abs(pressure - tank)) > 2 * step:
-        upper, lower = port_flow(pressure + step, *PORT)[0], port_flow(pressure - step, *PORT)[0]
+        upper, lower = (
+            relief_and_makeup_flow(pressure + step, *PORT)[0],
+            relief_and_makeup_flow(pressure - step, *PORT)[0],
+        )
         assert slope == pytest.approx((upper - lower) / (2 * step), abs=1e-15)  # 1e-2 / 1e16 / 1 Pa
 
 
 def test_port_flow_is_continuous_where_the_valves_open():
-    assert port_flow(32.0e6, *PORT)[0] == 0.0
-    assert port_flow(0.3e6, *PORT)[0] == 0.0
+    assert relief_and_makeup_flow(32.0e6, *PORT)[0] == 0.0
+    assert relief_and_makeup_flow(0.3e6, *PORT)[0] == 0.0
 
 
 @given(st.floats(-2, 2))

@@ -7,9 +7,9 @@ from scipy.integrate import solve_ivp
 from hydrotele.effects import EFFECTS, apply_effect, with_value
 from hydrotele.hydraulics.actuator import (
     actuator_friction,
+    advance_bristle_force,
     bristle_friction,
     bristle_rate,
-    bristle_step,
     implicit_bristle_friction,
     sliding_friction,
 )
@@ -17,7 +17,7 @@ from hydrotele.hydraulics.circuit import (
     SCRATCH_SIZE,
     Slot,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
     demanded_flow_fraction,
     step_circuit,
 )
@@ -63,7 +63,7 @@ def test_hysteresis_is_that_of_an_independent_integration(size):
     force = np.zeros(len(time))
     for k, v in enumerate(np.diff(way) / dt):
         level = sliding_friction(v, COULOMB, STRIBECK, SLOW, UNEQUAL)
-        force[k + 1] = bristle_step(force[k], v, level, STIFFNESS, dt)
+        force[k + 1] = advance_bristle_force(force[k], v, level, STIFFNESS, dt)
     truth = integrated(way, lambda t: size * w * np.cos(w * t), 2.0, time).y[0]
     # velocities are held over a step: 1e-3 of the breakaway force is second order in 6e-3 rad
     assert np.abs(force - truth).max() < 1e-3 * (COULOMB + STRIBECK)
@@ -85,7 +85,7 @@ def test_without_stribeck_friction_it_is_dahls_curve():
     for speed, parts in ((1e-3, 1), (0.3, 1), (1e-3, 7)):
         force, dt = 0.0, way / speed / parts
         for _ in range(parts):
-            force = bristle_step(force, speed, COULOMB, STIFFNESS, dt)
+            force = advance_bristle_force(force, speed, COULOMB, STIFFNESS, dt)
         assert force == pytest.approx(COULOMB * (1.0 - np.exp(-1.0)), rel=1e-12)  # rounding
 
 
@@ -190,7 +190,7 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     user, dt, lag = slow_pump(0.1), 2.5e-4, 0.1
     now, scratch, rates = slow_pump(0.0), np.zeros(SCRATCH_SIZE), np.zeros(5)
     act = np.array([0.6, 0.0, 2e6, 2e6, 0.0])
-    compute_ports(user, act, act, scratch, 0, 1, 0.0, act)
+    compute_inlet_conditions(user, act, act, scratch, 0, 1, 0.0, act)
     wanted = demanded_flow_fraction(user, 0, 1, scratch)
     without = circuit_supply_pressure(now, 0, 1, scratch, 1.0)
     assert 0.2 < wanted < 1.0

@@ -9,8 +9,8 @@ from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import PumpSlot
 from hydrotele.hydraulics.pump import (
     accumulator_pressure,
+    chamber_compliance,
     load_pressure_step,
-    oil_compliance,
     pump_flows,
     pump_piston_friction,
     pump_speed_step,
@@ -96,7 +96,7 @@ def test_compliance_of_air_is_the_slope_of_boyles_law():
         return air * ATMOSPHERE / (pressure + ATMOSPHERE)
 
     slope = (volume(p - step) - volume(p + step)) / (2.0 * step)
-    assert oil_compliance(0.0, 1.0e9, 0.0, air, p) == pytest.approx(slope, rel=1e-8)
+    assert chamber_compliance(0.0, 1.0e9, 0.0, air, p) == pytest.approx(slope, rel=1e-8)
 
 
 def test_load_follows_its_void_and_its_oil_then_its_relief(block):

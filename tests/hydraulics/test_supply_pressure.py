@@ -9,8 +9,8 @@ from hydrotele.hydraulics.circuit import (
     SLOT_COUNT,
     Slot,
     axis_flows_and_force,
-    compute_ports,
-    supply_pressure,
+    compute_inlet_conditions,
+    solve_supply_pressure,
 )
 
 RELIEF, SMOOTHING = 28.0e6, 5.0e4
@@ -24,7 +24,7 @@ def solve(valves, pump_flow):
     ports = np.zeros(4 * len(valves))
     for i, (gain, load) in enumerate(valves):
         ports[4 * i : 4 * i + 2] = gain, load
-    return supply_pressure(ports, len(valves), SMOOTHING, RELIEF, pump_flow)
+    return solve_supply_pressure(ports, len(valves), SMOOTHING, RELIEF, pump_flow)
 
 
 def demand(valves, pressure):
@@ -96,8 +96,8 @@ def user_of(*gains):
 def test_two_open_valves_share_the_pump_flow(opening):
     user, ports = user_of(2.3e-6, 2.3e-6), np.zeros(8)
     act = np.array([opening[0], 0, 8e6, 3e6, opening[1], 0, 6e6, 4e6])
-    compute_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
-    pressure = supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
+    compute_inlet_conditions(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
+    pressure = solve_supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
     assert pressure < RELIEF
     drawn, loads = [], []
     for i in range(2):
@@ -114,8 +114,8 @@ def test_two_open_valves_share_the_pump_flow(opening):
 def test_load_check_keeps_a_heavy_load_from_feeding_a_light_one():
     user, ports = user_of(2.3e-6, 6e-6), np.zeros(8)
     act = np.array([1.0, 0, 25e6, 3e6, 1.0, 0, 1e6, 2e6])
-    compute_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
-    pressure = supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
+    compute_inlet_conditions(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
+    pressure = solve_supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
     assert pressure < 25e6
     assert axis_flows_and_force(user, 0, pressure, act[:4], 0.0, 0.0)[0] == 0.0
     assert axis_flows_and_force(user, 1, pressure, act[4:], 0.0, 0.0)[0] == pytest.approx(5e-3, rel=1e-9)

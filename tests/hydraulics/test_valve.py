@@ -12,16 +12,16 @@ from hydrotele.hydraulics.circuit import (
     SLOT_COUNT,
     circuit_scratch,
     circuit_supply_pressure,
-    compute_ports,
+    compute_inlet_conditions,
+    compute_supply_pressure_derivatives,
     step_circuit,
-    supply_coupling,
 )
 from hydrotele.hydraulics.laws import (
-    axis_opening,
+    axis_valve_opening,
     chamber_flows,
     counterbalance_opening,
+    end_stop_force,
     spool_step,
-    stop_force,
     valve_opening,
 )
 from hydrotele.hydraulics.parameters import Slot, actuator_parameters
@@ -59,16 +59,16 @@ def g(drop):
 
 @pytest.mark.parametrize("spool", [-1.3, -0.5, -0.041, -0.04, 0.0, 0.03, 0.2, 1.0, 1.1])
 def test_a_plain_valve_opens_as_the_law_says_to_the_last_bit(spool):
-    assert axis_opening(record(), 0, spool) == valve_opening(spool, 0.04)
+    assert axis_valve_opening(record(), 0, spool) == valve_opening(spool, 0.04)
 
 
 def test_a_flow_curve_is_interpolated_and_goes_on_beyond_its_end():
     user = record(valve={"deadband": 0.1, "negative": {"curve": CURVE, "deadband": 0.0}})
     travel = np.linspace(0.0, 1.0, 41)
-    found = [axis_opening(user, 0, -t) for t in travel]
+    found = [axis_valve_opening(user, 0, -t) for t in travel]
     np.testing.assert_allclose(found, -np.interp(travel, CURVE["travel"], CURVE["opening"]), rtol=1e-14, atol=1e-16)
-    assert axis_opening(user, 0, -1.2) == pytest.approx(-(0.8 + 0.2 * 0.5 / 0.5), rel=1e-12)
-    assert axis_opening(user, 0, 0.4) == valve_opening(0.4, 0.1), "the other direction is straight"
+    assert axis_valve_opening(user, 0, -1.2) == pytest.approx(-(0.8 + 0.2 * 0.5 / 0.5), rel=1e-12)
+    assert axis_valve_opening(user, 0, 0.4) == valve_opening(0.4, 0.1), "the other direction is straight"
 
 
 def test_eight_knots_fit_and_the_two_curves_do_not_touch():
@@ -77,8 +77,8 @@ def test_eight_knots_fit_and_the_two_curves_do_not_touch():
     user = record(valve={"deadband": 0.0, "positive": {"curve": shapes[0]},
                          "negative": {"curve": shapes[1]}})  # fmt: skip
     for t in knots:
-        assert axis_opening(user, 0, t) == pytest.approx(t**2, abs=1e-15)
-        assert axis_opening(user, 0, -t) == pytest.approx(-(t**3), abs=1e-15)
+        assert axis_valve_opening(user, 0, t) == pytest.approx(t**2, abs=1e-15)
+        assert axis_valve_opening(user, 0, -t) == pytest.approx(-(t**3), abs=1e-15)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -118,7 +118,7 @@ def test_a_counterbalance_valve_holds_until_the_pilot_opens_it():
 @pytest.mark.parametrize("spool", [-0.5, 0.0, 0.5])
 def test_a_spool_leaks_to_tank_at_any_opening(spool):
     leak = 2.7e-14
-    opening = axis_opening(record(), 0, spool)
+    opening = axis_valve_opening(record(), 0, spool)
     flows = np.array(chamber_flows(record(), 0, opening, 20e6, 12e6, 5e6))
     leaky = np.array(chamber_flows(record(valve={"tank_leakage": leak}), 0, opening, 20e6, 12e6,
                                    5e6))  # fmt: skip
@@ -257,7 +257,7 @@ def supply_of(act, **supply):
     user = np.concatenate(list(actuator_parameters(changed_machine(supply=supply)).values()))
     ports = circuit_scratch()
     act = np.array(act, float)
-    compute_ports(user, act, act, ports, 0, 3, 0.0, act)
+    compute_inlet_conditions(user, act, act, ports, 0, 3, 0.0, act)
     return circuit_supply_pressure(user, 0, 3, ports, 1.0), user, ports
 
 
@@ -308,7 +308,7 @@ def test_the_supply_follows_the_chambers_with_an_override_as_its_coupling_says(a
     given = {"relief_override": 8e8}
     pressure, user, ports = supply_of(act, **given)
     slopes = np.zeros(len(ports))
-    assert supply_coupling(user, 0, 3, ports, pressure, slopes)
+    assert compute_supply_pressure_derivatives(user, 0, 3, ports, pressure, slopes)
     for i in range(3):
         side = 2 if act[4 * i] > 0.0 else 3
         moved = [list(act), list(act)]
@@ -360,16 +360,16 @@ def test_chambers_keep_their_volume_beyond_the_ends():
         swept = user[Slot.AREA_HEAD if v < 0 else Slot.AREA_ROD] * abs(v)
         assert squeezed == pytest.approx(32e6 + swept / 1e-9, rel=0.01), "over the port relief"
         np.testing.assert_array_equal(
-            CYLINDER.volumes(np.array([x])),
-            CYLINDER.volumes(np.array([0.0 if x < 0 else 1.05])),
+            CYLINDER.chamber_volumes(np.array([x])),
+            CYLINDER.chamber_volumes(np.array([0.0 if x < 0 else 1.05])),
         )
 
 
 def test_stops_push_and_never_pull():
-    assert stop_force(0.5, 9.0, 0.0, 1.0, 1e8, 1e6) == (0.0, 0.0, 0.0)
-    assert stop_force(-1e-3, 0.0, 0.0, 1.0, 1e8, 1e6)[0] == pytest.approx(1e5)
-    assert stop_force(1.001, 0.05, 0.0, 1.0, 1e8, 1e6)[0] == pytest.approx(-1.5e5)
-    assert stop_force(1.001, -0.2, 0.0, 1.0, 1e8, 1e6) == (0.0, 0.0, 0.0), "it lets go"
+    assert end_stop_force(0.5, 9.0, 0.0, 1.0, 1e8, 1e6) == (0.0, 0.0, 0.0)
+    assert end_stop_force(-1e-3, 0.0, 0.0, 1.0, 1e8, 1e6)[0] == pytest.approx(1e5)
+    assert end_stop_force(1.001, 0.05, 0.0, 1.0, 1e8, 1e6)[0] == pytest.approx(-1.5e5)
+    assert end_stop_force(1.001, -0.2, 0.0, 1.0, 1e8, 1e6) == (0.0, 0.0, 0.0), "it lets go"
 
 
 def test_stroke_and_joint_range_end_the_travel():

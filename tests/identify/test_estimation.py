@@ -8,7 +8,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import build_records, cut_beginning
+from hydrotele.identify.record import build_records, keep_beginning
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
@@ -77,7 +77,7 @@ def test_instruments_ask_for_a_repeated_motion(repeated):
         identify_dynamics(fit, heldout, setup, Processing(), Estimator("instruments"))
     with pytest.raises(InputError, match="repeat"):
         identify_dynamics(fit, heldout, setup, Processing(period=0.1), Estimator("instruments"))
-    once = [cut_beginning(fit[0], 25.0)]
+    once = [keep_beginning(fit[0], 25.0)]
     with pytest.raises(InputError, match="does not repeat"):
         identify_dynamics(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))
 

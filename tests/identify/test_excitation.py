@@ -9,7 +9,7 @@ from hydrotele.identify.excitation import (
     MachineLimits,
     compute_information,
     design_motion,
-    select_informative_base,
+    select_determinable_parameters,
 )
 from hydrotele.identify.record import compute_force_noise
 from hydrotele.identify.setup import machine_setup
@@ -41,7 +41,7 @@ def test_motion_is_its_own_derivative():
 @pytest.mark.nightly
 def test_a_cylinder_on_rails_is_driven_within_its_limits_and_tells_more(rig, tmp_path):
     machine, setup, noise = rig
-    places = select_informative_base(machine, setup, noise, 6.0)
+    places = select_determinable_parameters(machine, setup, noise, 6.0)
     assert len(places) >= 3  # mass, Coulomb and viscous friction
     short = dict(period=6.0, harmonics=3, starts=1)
     limits = MachineLimits(machine, setup)

@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import filter_periodic
-from hydrotele.identify.smoothing import filter_zero_phase, smooth
+from hydrotele.identify.smoothing import filter_zero_phase, smooth_and_differentiate
 
 DT = 0.02
 
@@ -107,7 +107,7 @@ def test_what_knows_more_of_the_signal_differentiates_better():
     samples = truth[0] + rng.normal(0, 2e-3, 2000)
     found = {
         "periodic": filter_periodic(samples, DT, 500, harmonics=5).acceleration,
-        "optimal": smooth(samples, DT, noise=2e-3).acceleration,
+        "optimal": smooth_and_differentiate(samples, DT, noise=2e-3).acceleration,
         "zero phase": filter_zero_phase(samples, DT, cutoff=5.0).acceleration,
         "raw": np.gradient(np.gradient(samples, DT), DT),
     }

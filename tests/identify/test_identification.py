@@ -10,7 +10,7 @@ from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identifiability import STATUS_FULL, STATUS_WEAK
 from hydrotele.identify.identification import identify_dynamics, identify_with_friction_shapes
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import build_records, cut_beginning
+from hydrotele.identify.record import build_records, keep_beginning
 from hydrotele.identify.result import count_statuses, parameter_rows
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset
@@ -37,7 +37,7 @@ def found(clean):
 def short(clean):
     """The first half of every run: enough for what a fault of the data changes."""
     fit, heldout, setup = clean
-    return [cut_beginning(run, 20.0) for run in fit], cut_beginning(heldout, 20.0), setup
+    return [keep_beginning(run, 20.0) for run in fit], keep_beginning(heldout, 20.0), setup
 
 
 @pytest.fixture(scope="module")

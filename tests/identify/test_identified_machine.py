@@ -17,7 +17,7 @@ from hydrotele.identify.result import (
     HeldOutForces,
     Identification,
 )
-from hydrotele.identify.setup import cylinder_bars, machine_setup
+from hydrotele.identify.setup import machine_setup, map_cylinder_bodies
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, make_regressor, project_on_drives
@@ -91,7 +91,7 @@ def test_a_machine_of_the_family_is_found_again(truth):
     table, told = table_of(load_machine("cat215"))
     other, _ = table_of(truth)
     found = as_found(table, told, other.nominal)
-    machine, best = build_identified_machine(load_machine("cat215"), found, cylinder_bars(truth))
+    machine, best = build_identified_machine(load_machine("cat215"), found, map_cylinder_bodies(truth))
     # the prior pulls by less than a standard deviation in every direction
     assert best.squared_distance < len(told.base)
     again, _ = table_of(machine)

@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.identify.motion import (
     Processing,
-    apply_adjoint,
+    apply_filter_adjoint,
     compute_joint_motion,
     estimate_resolution,
 )
@@ -69,7 +69,7 @@ def test_the_adjoint_tells_what_every_position_adds_to_a_sum(how):
     motions = [compute_joint_motion(p, PERIOD, found, how) for p in (positions, moved)]
     change = [np.stack([m.value, m.rate, m.acceleration]) for m in motions]
     expected = np.einsum("xpnj,xnj->p", gain[..., :1], (change[1] - change[0])[..., :1])
-    single = apply_adjoint(gain, PERIOD, found, how)
+    single = apply_filter_adjoint(gain, PERIOD, found, how)
     assert np.allclose(np.einsum("pnj,nj->p", single, moved - positions), expected, rtol=1e-6)
     assert not single[..., 1].any()  # a joint that rests
 

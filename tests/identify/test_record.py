@@ -13,7 +13,7 @@ from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 
 ROWS = 600
 AXES = {"swing": 0.1, "boom": 0.45, "stick": -1.6}
@@ -37,7 +37,7 @@ def made_up(drop=(), noise=1.0):
                 wave = 1e6 * np.sin(0.3 * time + k)
                 columns[f"pressure_{side}.{axis}"] = level + wave + noise * 1e5 * rng.normal(size=ROWS)
         kept = {c: v for c, v in columns.items() if c not in drop}
-        units = {c: default_unit(c) for c in kept}
+        units = {c: default_channel_unit(c) for c in kept}
         runs.append(RunFiles(name, (Log(time, kept, units, {"machine": "cat215"}, name),)))
     return make_dataset(runs, machine, "khoshzaban1992")
 

@@ -56,7 +56,7 @@ def test_ball_joints_carry_no_moment_about_a_cylinders_axis():
     for ball_joints in (True, False):
         setup = machine_setup(machine, chain, ball_joints=ball_joints)
         # the swing accelerates alone, so that tubes and rods are turned about their axes
-        table = setup.compute_regressor(setup.project(pose, 0.0 * pose, np.array([[1.0, 0.0, 0.0]])))
+        table = setup.compute_regressor(setup.project_motion_on_drives(pose, 0.0 * pose, np.array([[1.0, 0.0, 0.0]])))
         column = [n.endswith("_tube") and n.startswith("inertia_xx") for n in table.names]
         columns[ball_joints] = table.matrix[0, 0, np.flatnonzero(column)]
     assert np.all(np.abs(columns[True]) < 1e-15), "rounding"
@@ -68,4 +68,4 @@ def test_a_body_without_moment_that_is_not_there_is_refused():
     own = replace(mechanism_setup(chain), moment_free={"wing": (1.0, 0.0, 0.0)})
     legs = chain.start[[chain.index(d) for d in chain.drives]][None]
     with pytest.raises(InputError, match="has no body wing"):
-        own.project(legs, 0.0 * legs, 0.0 * legs)
+        own.project_motion_on_drives(legs, 0.0 * legs, 0.0 * legs)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.smoothing import sample_errors, smooth, transition_matrices
+from hydrotele.identify.smoothing import sample_smoothing_errors, smooth_and_differentiate, transition_matrices
 
 DT = 0.02
 
@@ -47,7 +47,7 @@ def test_it_is_the_minimum_of_the_penalised_squares(order):
     right = np.concatenate([samples[known], np.zeros(rows - 1)])
     best = np.linalg.lstsq(system, right)[0]
     covariance = np.linalg.inv(system.T @ system)
-    found = smooth(samples, 1.0, noise=1.0, input_std=np.sqrt(ratio), order=order)
+    found = smooth_and_differentiate(samples, 1.0, noise=1.0, input_std=np.sqrt(ratio), order=order)
     # rounding of the dense normal equations, whose condition number is 1e7 or so
     assert found.value == pytest.approx(value @ best, abs=1e-6)
     spread = np.sqrt(np.einsum("ij,jk,ik->i", value, covariance, value))
@@ -57,7 +57,7 @@ def test_it_is_the_minimum_of_the_penalised_squares(order):
 def test_errors_against_truth_are_far_below_the_noise():
     time = DT * np.arange(2000)
     truth, rng = sines(time), np.random.default_rng(2)
-    found = smooth(truth[0] + rng.uniform(-1, 1, 2000) * 1.75e-3, DT, noise=1.75e-3 / np.sqrt(3))
+    found = smooth_and_differentiate(truth[0] + rng.uniform(-1, 1, 2000) * 1.75e-3, DT, noise=1.75e-3 / np.sqrt(3))
     inner = slice(50, -50)
     errors = [
         np.sqrt(np.mean((got - true)[inner] ** 2))
@@ -77,7 +77,7 @@ def test_standard_deviations_cover_95_percent_of_the_errors(order):
     for seed in range(20):
         truth = chain(1000, 3.0, order, seed)
         rng = np.random.default_rng(1000 + seed)
-        found = smooth(truth[:, 0] + rng.normal(0, 1e-3, 1000), DT, noise=1e-3, order=order)
+        found = smooth_and_differentiate(truth[:, 0] + rng.normal(0, 1e-3, 1000), DT, noise=1e-3, order=order)
         roughness.append(found.input_std[0])
         for k, kind in enumerate(("value", "rate", "acceleration")):
             error = np.abs(getattr(found, kind) - truth[:, k])
@@ -90,7 +90,7 @@ def test_standard_deviations_cover_95_percent_of_the_errors(order):
 
 def test_unknown_noise_is_found():
     truth = chain(4000, 2.0, 3, 5)[:, 0]
-    found = smooth(truth + np.random.default_rng(6).normal(0, 2e-3, 4000), DT)
+    found = smooth_and_differentiate(truth + np.random.default_rng(6).normal(0, 2e-3, 4000), DT)
     assert found.noise[0] == pytest.approx(2e-3, rel=0.05)  # 4000 samples: 1.1 % by chance
     assert found.input_std[0] == pytest.approx(2.0, rel=0.2)
 
@@ -98,7 +98,7 @@ def test_unknown_noise_is_found():
 def test_cross_validation_chooses_about_the_same():
     truth = chain(4000, 2.0, 3, 7)[:, 0]
     samples = truth + np.random.default_rng(8).normal(0, 2e-3, 4000)
-    found = smooth(samples, DT, noise=2e-3, method="validation")
+    found = smooth_and_differentiate(samples, DT, noise=2e-3, method="validation")
     # asymptotically as good a smoother, with a flatter criterion: within a factor of 2
     assert 1.0 < found.input_std[0] < 4.0
 
@@ -110,7 +110,7 @@ def test_noise_falls_with_the_sample_rate_as_theory_says():
     """
     spread = {}
     for dt in (0.004, 0.002):
-        found = smooth(
+        found = smooth_and_differentiate(
             np.zeros(4001), dt, noise=1e-3, input_std=4.0 / np.sqrt(dt)  # the same density
         )  # fmt: skip
         spread[dt] = [s[2000] for s in (found.value_std, found.rate_std, found.acceleration_std)]
@@ -124,7 +124,7 @@ def test_missing_samples_are_bridged_with_honest_doubt():
     samples = truth[0] + rng.normal(0, 1e-3, 600)
     samples[200:220] = np.nan
     samples[rng.integers(0, 600, 30)] = np.nan
-    found = smooth(samples, DT, noise=1e-3)
+    found = smooth_and_differentiate(samples, DT, noise=1e-3)
     assert np.isfinite(found.acceleration).all()
     assert found.value_std[210] > 2 * found.value_std[300]
     assert abs(found.value - truth[0])[200:220].max() < 4 * found.value_std[200:220].max()
@@ -134,13 +134,13 @@ def test_missing_samples_are_bridged_with_honest_doubt():
 def test_columns_are_smoothed_each_for_itself_and_in_their_units():
     rng = np.random.default_rng(10)
     samples = np.column_stack([sines(DT * np.arange(300))[0]] * 2) + rng.normal(0, 1e-3, (300, 2))
-    both = smooth(samples * [1.0, 1e9], DT, noise=np.array([1e-3, 1e6]))
-    one = smooth(samples[:, 1], DT, noise=1e-3)
+    both = smooth_and_differentiate(samples * [1.0, 1e9], DT, noise=np.array([1e-3, 1e6]))
+    one = smooth_and_differentiate(samples[:, 1], DT, noise=1e-3)
     assert both.rate.shape == (300, 2) and one.rate.shape == (300,)
     for kind in ("value", "rate", "acceleration", "value_std", "rate_std", "acceleration_std"):
         # scaling by 1e9 rounds differently, and the best roughness is found to 2 %
         assert getattr(both, kind)[:, 1] / 1e9 == pytest.approx(getattr(one, kind), rel=1e-6)
-    slow = smooth(samples[:, 1], 10 * DT, noise=1e-3)  # the same samples on a slower clock
+    slow = smooth_and_differentiate(samples[:, 1], 10 * DT, noise=1e-3)  # the same samples on a slower clock
     assert slow.acceleration == pytest.approx(one.acceleration / 100, rel=1e-9)
     assert slow.input_std == pytest.approx(one.input_std / 1000, rel=1e-9)
 
@@ -148,8 +148,8 @@ def test_columns_are_smoothed_each_for_itself_and_in_their_units():
 def test_drawn_errors_have_the_stated_deviations():
     samples = chain(500, 3.0, 3, 11)[:, 0] + np.random.default_rng(12).normal(0, 1e-3, 500)
     samples[100:130] = np.nan
-    found = smooth(samples, DT, noise=1e-3)
-    draws = sample_errors(found, 400, seed=1)[..., 0]
+    found = smooth_and_differentiate(samples, DT, noise=1e-3)
+    draws = sample_smoothing_errors(found, 400, seed=1)[..., 0]
     assert draws.shape == (400, 3, 500)
     for k, spread in enumerate((found.value_std, found.rate_std, found.acceleration_std)):
         # 400 draws know a deviation to 3.5 %; the largest of 500 correlated ones lies near 4 sigma
@@ -159,18 +159,18 @@ def test_drawn_errors_have_the_stated_deviations():
 def test_refuses_what_it_cannot_smooth():
     good = np.arange(20.0)
     with pytest.raises(InputError, match="at least 5"):
-        smooth(np.r_[good[:4], np.full(10, np.nan)], DT, noise=1.0)
+        smooth_and_differentiate(np.r_[good[:4], np.full(10, np.nan)], DT, noise=1.0)
     with pytest.raises(InputError, match="column 0, row 3 is infinite"):
-        smooth(np.where(good == 3, np.inf, good), DT, noise=1.0)
+        smooth_and_differentiate(np.where(good == 3, np.inf, good), DT, noise=1.0)
     with pytest.raises(InputError, match="period must be positive"):
-        smooth(good, 0.0, noise=1.0)
+        smooth_and_differentiate(good, 0.0, noise=1.0)
     with pytest.raises(InputError, match="noise must be positive"):
-        smooth(good, DT, noise=-1.0)
+        smooth_and_differentiate(good, DT, noise=-1.0)
     with pytest.raises(InputError, match="without noise"):
-        smooth(good, DT, input_std=1.0)
+        smooth_and_differentiate(good, DT, input_std=1.0)
     with pytest.raises(InputError, match="constant"):
-        smooth(np.ones(20), DT)
+        smooth_and_differentiate(np.ones(20), DT)
     with pytest.raises(InputError, match="order must be 3 or 4"):
-        smooth(good, DT, order=2)
+        smooth_and_differentiate(good, DT, order=2)
     with pytest.raises(InputError, match=r"\(n,\) or \(n, k\)"):
-        smooth(np.zeros((3, 3, 3)), DT)
+        smooth_and_differentiate(np.zeros((3, 3, 3)), DT)

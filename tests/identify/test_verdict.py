@@ -12,7 +12,7 @@ from hydrotele.identify.identification import identify_with_friction_shapes
 from hydrotele.identify.mechanism import load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.result import HeldOutError
-from hydrotele.identify.verdict import describe_status
+from hydrotele.identify.verdict import assess_identification
 from hydrotele.identify.wild_readings import find_wild_readings
 from tools.studies.friction_coverage import compare_friction, load_arm, record_run
 
@@ -143,7 +143,7 @@ def heldout_error(**changes):
     ],
 )  # fmt: skip
 def test_the_verdict_names_the_problem(pendulum, changes, fitted, status):
-    assert describe_status(heldout_error(**changes), {"hinge": fitted}, np.array([False]), pendulum) == status
+    assert assess_identification(heldout_error(**changes), {"hinge": fitted}, np.array([False]), pendulum) == status
 
 
 def test_friction_of_a_smooth_law_is_not_underestimated():

@@ -12,8 +12,8 @@ from hydrotele.kinematics.arm import (
     ArmGeometry,
     UnreachableError,
     cartesian_jacobian,
-    forward_cartesian,
     forward_kinematics,
+    forward_kinematics_cartesian,
     inverse_kinematics,
     jacobian,
 )
@@ -77,7 +77,7 @@ def central_difference(function, q, step=1e-5):
 
 def plane_x(geometry, q):
     """Distance of the controlled point ahead of the swing axis in the arm plane."""
-    return forward_cartesian(geometry, (0.0, *q[1:]))[0]
+    return forward_kinematics_cartesian(geometry, (0.0, *q[1:]))[0]
 
 
 @given(MACHINE_Q)
@@ -190,7 +190,7 @@ def test_jacobians_are_the_derivatives(geometry, swing, boom, stick, tool):
     assume(plane_x(geometry, q) > 0.5)
     for function, derivative in (
         (forward_kinematics, jacobian),
-        (forward_cartesian, cartesian_jacobian),
+        (forward_kinematics_cartesian, cartesian_jacobian),
     ):
         numeric = central_difference(lambda p, f=function: f(geometry, p), q)
         np.testing.assert_allclose(derivative(geometry, q), numeric, rtol=0, atol=1e-7)
@@ -228,7 +228,7 @@ def test_forward_and_jacobian_are_mujocos(geometry):
         moving = np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, moving, None, 0)
         end = data.site_xpos[0]
-        np.testing.assert_allclose(forward_cartesian(geometry, q), end, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(forward_kinematics_cartesian(geometry, q), end, rtol=0, atol=1e-12)
         np.testing.assert_allclose(cartesian_jacobian(geometry, q), moving, rtol=0, atol=1e-12)
         r = math.hypot(end[0], end[1])
         cylindrical = np.array([end[0] * moving[0] + end[1] * moving[1], end[0] * moving[1] - end[1] * moving[0]])
@@ -243,7 +243,7 @@ def test_forward_and_jacobian_are_mujocos(geometry):
 @given(MACHINE_Q, st.tuples(*[st.floats(-1e5, 1e5)] * 3))
 def test_the_transpose_does_the_same_work(q, force):
     """A force gives the same torques through both Jacobians, resolved along r, theta and z."""
-    x, y, _ = forward_cartesian(CAT215, q)
+    x, y, _ = forward_kinematics_cartesian(CAT215, q)
     r = math.hypot(x, y)
     in_cylinder = np.array([(x * force[0] + y * force[1]) / r, x * force[1] - y * force[0], force[2]])
     np.testing.assert_allclose(

@@ -11,8 +11,8 @@ from hydrotele.kinematics.five_dof import (
     FellerGeometry,
     FellerPose,
     forward_kinematics,
-    inverse_for_direction,
     inverse_kinematics,
+    inverse_kinematics_for_direction,
     jacobian,
     tool_direction,
 )
@@ -66,7 +66,7 @@ def test_both_inverses_find_the_joint_angles(q):
     assume(pose.x * c + pose.y * s > 0.01)
     found = inverse_kinematics(ARM, pose)
     assert not found.is_clamped and same(found.q, q)
-    several = inverse_for_direction(ARM, pose[:3], tool_direction(q))
+    several = inverse_kinematics_for_direction(ARM, pose[:3], tool_direction(q))
     assert 1 <= len(several) <= 4 and any(same(one.q, q) for one in several)
     for one in several:  # every one of them is a solution, not only the one that was put in
         assert np.allclose(forward_kinematics(ARM, one.q)[:3], pose[:3], atol=1e-8)
@@ -89,16 +89,16 @@ def test_the_jacobian_is_the_derivative(q):
 def test_four_solutions_and_none():
     q = (0.3, 0.9, -2.0, 0.4, 0.5)
     pose = forward_kinematics(ARM, q)
-    assert len(inverse_for_direction(ARM, pose[:3], tool_direction(q))) >= 2
-    above = inverse_for_direction(ARM, (0.4, 0.1, 6.5), (1.0, 0.2, 0.3))
+    assert len(inverse_kinematics_for_direction(ARM, pose[:3], tool_direction(q))) >= 2
+    above = inverse_kinematics_for_direction(ARM, (0.4, 0.1, 6.5), (1.0, 0.2, 0.3))
     assert len(above) == 4
-    assert inverse_for_direction(ARM, (30.0, 0.0, 0.0), (1.0, 0.0, 0.0)) == ()
+    assert inverse_kinematics_for_direction(ARM, (30.0, 0.0, 0.0), (1.0, 0.0, 0.0)) == ()
     with pytest.raises(ValueError, match="no length"):
-        inverse_for_direction(ARM, (5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        inverse_kinematics_for_direction(ARM, (5.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 def test_a_direction_across_the_plane_leaves_the_attitude_open():
-    found = inverse_for_direction(ARM, (6.0, 0.35, 2.0), (0.0, 1.0, 0.0))
+    found = inverse_kinematics_for_direction(ARM, (6.0, 0.35, 2.0), (0.0, 1.0, 0.0))
     assert found
     for one in found:
         assert np.allclose(forward_kinematics(ARM, one.q)[:3], (6.0, 0.35, 2.0), atol=1e-8)

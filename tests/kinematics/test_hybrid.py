@@ -9,15 +9,15 @@ from hydrotele.kinematics.hybrid import (
     REVOLUTE,
     PlatformPose,
     UnreachableError,
-    apply_errors,
+    apply_geometry_errors,
     batch_readings,
     build_error_model,
     carriage_pose,
     convert_to_axes,
     euler_to_rotation,
     first_order_carriage_pose,
-    forward_by_evolution,
     forward_kinematics,
+    forward_kinematics_by_evolution,
     home_pose,
     inverse_kinematics,
     leg_jacobian,
@@ -66,7 +66,7 @@ def test_forward_undoes_inverse_by_newton_and_by_differential_evolution():
     joints, legs, pose = poses()
     assert np.allclose(inverse_kinematics(IWR, pose, joints), legs, atol=ROUNDING)
     one = PlatformPose(pose.rotation[0], pose.position[0])
-    evolved = forward_by_evolution(IWR, joints[0], legs[0], seed=3)
+    evolved = forward_kinematics_by_evolution(IWR, joints[0], legs[0], seed=3)
     assert np.abs(pose_difference(evolved, one)).max() < 1e-6  # a hundredth of 0.1 mm
 
 
@@ -129,12 +129,12 @@ def test_errors_in_batches_are_those_of_the_robot_as_built(kind):
     joints, _, pose = poses()
     model = build_error_model(IWR, kind)
     assert len(model.names) == len(set(model.names)) == 54
-    assert model.carriage_count == 12
+    assert model.carriage_parameter_count == 12
     rng = np.random.default_rng(2)
     errors = rng.normal(size=(3, 54)) * model.scales
     batch = predict_leg_readings(model, errors, joints, pose.rotation, pose.position)
     for one, found in zip(errors, batch, strict=True):
-        built = apply_errors(model, one)
+        built = apply_geometry_errors(model, one)
         assert np.allclose(leg_readings(built, joints, pose), found, atol=ROUNDING)
     zero = predict_leg_readings(model, np.zeros(54), joints, pose.rotation, pose.position)
     assert np.allclose(zero[0], leg_readings(IWR, joints, pose), atol=ROUNDING)
@@ -159,7 +159,7 @@ def test_first_order_model_is_the_derivative_of_the_exact_one():
     errors = np.random.default_rng(4).normal(size=54) * model.scales
     left = []
     for share in (1.0, 0.5):
-        exact = carriage_pose(apply_errors(model, share * errors), joints)
+        exact = carriage_pose(apply_geometry_errors(model, share * errors), joints)
         straight = first_order_carriage_pose(IWR, share * errors[:12], joints)
         left.append(np.abs(exact - straight).max())
     assert left[0] / left[1] == pytest.approx(4.0, rel=0.02)  # third order: 1 mrad of the second

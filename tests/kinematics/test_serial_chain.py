@@ -11,10 +11,10 @@ from hydrotele.kinematics.serial_chain import (
     chain_from_dh,
     chain_from_frames,
     chain_poses,
-    chain_poses_and_rates,
-    exponential,
+    chain_poses_and_derivatives,
     joint_axes,
     product_of_exponentials,
+    twist_exponential,
 )
 
 ROWS = [
@@ -49,12 +49,12 @@ def test_denavit_hartenberg_is_the_textbook_matrix():
 @pytest.mark.parametrize("form", ["dh", "frames"])
 def test_derivatives_are_those_of_complex_steps(form):
     rng = np.random.default_rng(1)
-    frames = [exponential(rng.uniform(-1.0, 1.0, 6)) for _ in range(5)]
+    frames = [twist_exponential(rng.uniform(-1.0, 1.0, 6)) for _ in range(5)]
     chain = CHAIN if form == "dh" else chain_from_frames(
         frames, ["rz", "ry", "tx", "rz"], ["a", "b", "c", "d"], (0.0, 0.0, 0.1)
     )  # fmt: skip
     values = chain.nominal_values + rng.uniform(-0.1, 0.1, len(chain.nominal_values))
-    exact = chain_poses_and_rates(chain, Q, values)
+    exact = chain_poses_and_derivatives(chain, Q, values)
     for k in range(len(values)):
         step = values.astype(complex)
         step[k] += 1e-30j
@@ -73,7 +73,7 @@ def test_derivatives_are_those_of_complex_steps(form):
 
 def test_joint_derivatives_follow_from_the_axes():
     points, ways = joint_axes(CHAIN, Q)
-    exact = chain_poses_and_rates(CHAIN, Q)
+    exact = chain_poses_and_derivatives(CHAIN, Q)
     for k in (0, 1, 3):
         arm = exact.position - points[:, k]
         np.testing.assert_allclose(exact.position_by_joint[:, :, k], np.cross(ways[:, k], arm), atol=1e-13)
@@ -86,7 +86,7 @@ def test_exponential_is_the_matrix_exponential():
         v, (x, y, z) = twist[:3], twist[3:]
         matrix = np.zeros((4, 4))
         matrix[:3] = np.column_stack([[[0, -z, y], [z, 0, -x], [-y, x, 0]], v])
-        np.testing.assert_allclose(exponential(twist), scipy.linalg.expm(matrix), atol=1e-13)
+        np.testing.assert_allclose(twist_exponential(twist), scipy.linalg.expm(matrix), atol=1e-13)
 
 
 def test_product_of_exponentials_is_the_chain():

@@ -6,19 +6,19 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.serial_chain import chain_poses
 from hydrotele.kinematics.serial_robot import (
-    correct_robot,
-    correct_urdf,
+    apply_calibrated_parameters,
+    compute_ball_poses,
     correction_derivatives,
     correction_names,
-    expand_joints,
+    expand_mimic_joints,
     frame_from_rpy,
     load_robot,
     robot_chain,
-    robot_poses,
     robot_to_yaml,
     rotation_to_rpy,
     shipped_robots,
-    solve_ball_positions,
+    solve_joints_for_ball,
+    write_origins_to_urdf,
 )
 
 URDF = """<robot name="two">
@@ -67,7 +67,7 @@ def test_urdf_and_mjcf_are_the_same_chain(files, name):
     robot = load_robot(files / name, 2)
     assert robot.joint_names == ("turn", "push")
     expected = [by_hand(q) for q in Q]
-    np.testing.assert_allclose(robot_poses(robot, Q).position, expected, atol=1e-12)
+    np.testing.assert_allclose(compute_ball_poses(robot, Q).position, expected, atol=1e-12)
 
 
 def test_corrections_are_the_chain_with_errors_and_survive_files(files):
@@ -75,13 +75,13 @@ def test_corrections_are_the_chain_with_errors_and_survive_files(files):
     chain = robot_chain(robot)
     values = chain.nominal_values + np.random.default_rng(1).normal(0.0, 0.01, len(chain.nominal_values))
     expected = chain_poses(chain, Q, values).position
-    made = correct_robot(robot, dict(zip(chain.parameters, values, strict=True)), {})
-    np.testing.assert_allclose(robot_poses(made, Q).position, expected, atol=1e-12)
+    made = apply_calibrated_parameters(robot, dict(zip(chain.parameters, values, strict=True)), {})
+    np.testing.assert_allclose(compute_ball_poses(made, Q).position, expected, atol=1e-12)
     (files / "new.yaml").write_text(robot_to_yaml(made, "test"))
-    (files / "new.urdf").write_text(correct_urdf(made, URDF))
+    (files / "new.urdf").write_text(write_origins_to_urdf(made, URDF))
     for name in ("new.yaml", "new.urdf"):
         again = load_robot(files / name, 2)
-        np.testing.assert_allclose(robot_poses(again, Q).position, expected, atol=1e-12)
+        np.testing.assert_allclose(compute_ball_poses(again, Q).position, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", shipped_robots())
@@ -89,8 +89,8 @@ def test_shipped_robots_reach_places_by_resolved_motion(name):
     robot = load_robot(name)
     rng = np.random.default_rng(2)
     joints = rng.uniform(-1.5, 1.5, (20, len(robot.joints)))
-    target = robot_poses(robot, joints).position + rng.normal(0.0, 0.01, (20, 3))
-    reached = solve_ball_positions(robot, target, joints)
+    target = compute_ball_poses(robot, joints).position + rng.normal(0.0, 0.01, (20, 3))
+    reached = solve_joints_for_ball(robot, target, joints)
     # Targets a centimetre away may lie out of reach at full stretch only.
     assert np.median(reached.remaining_distance) < 1e-9
 
@@ -101,12 +101,12 @@ def test_resolved_motion_with_the_corrections_ends_where_it_should():
     chain = robot_chain(nominal)
     values = chain.nominal_values + rng.normal(0.0, 1e-3, len(chain.nominal_values))
     sag = {name: 3e-4 for name in correction_names(nominal, True, False)}
-    true = correct_robot(nominal, dict(zip(chain.parameters, values, strict=True)), sag)
+    true = apply_calibrated_parameters(nominal, dict(zip(chain.parameters, values, strict=True)), sag)
     start = np.tile([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], (9, 1))
-    target = robot_poses(nominal, start).position + rng.normal(0.0, 0.05, (9, 3))
+    target = compute_ball_poses(nominal, start).position + rng.normal(0.0, 0.05, (9, 3))
     missed = {
         name: np.linalg.norm(
-            robot_poses(true, solve_ball_positions(robot, target, start).joints).position - target,
+            compute_ball_poses(true, solve_joints_for_ball(robot, target, start).joints).position - target,
             axis=1,
         ).max()
         for name, robot in {"nominal": nominal, "calibrated": true}.items()
@@ -120,7 +120,7 @@ def test_sag_is_the_weight_times_its_lever():
     joints = np.zeros((1, 6))
     names = [n for n in correction_names(robot, True, False) if n == "sag.joint2.tool"]
     # At zero the arm is stretched along -x: 0.425 + 0.3922 m and the ball 0.0 beyond in x.
-    lever = abs(robot_poses(robot, joints).position[0, 0])
+    lever = abs(compute_ball_poses(robot, joints).position[0, 0])
     assert abs(correction_derivatives(robot, joints, names)[0, 1, 0]) == pytest.approx(9.81 * lever, rel=1e-9)
 
 
@@ -168,15 +168,17 @@ def test_a_joint_that_mimics_another_needs_no_reading(tmp_path):
     assert robot.independent_joint_names == ("swing", "shoulder", "elbow", "wrist")
     four = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 4))
     five = np.insert(four, 3, -2.0 * four[:, 2] + 0.1, axis=1)
-    np.testing.assert_allclose(expand_joints(robot, four), five, atol=1e-15)
-    assert expand_joints(load_robot(tmp_path / "pal.urdf", 5), five) is five
-    target = robot_poses(robot, five).position + 0.01
-    reached = solve_ball_positions(robot, target, five)
+    np.testing.assert_allclose(expand_mimic_joints(robot, four), five, atol=1e-15)
+    assert expand_mimic_joints(load_robot(tmp_path / "pal.urdf", 5), five) is five
+    target = compute_ball_poses(robot, five).position + 0.01
+    reached = solve_joints_for_ball(robot, target, five)
     assert reached.remaining_distance.max() < 1e-9
     np.testing.assert_allclose(reached.joints[:, 3], -2.0 * reached.joints[:, 2] + 0.1, atol=1e-12)
     (tmp_path / "new.yaml").write_text(robot_to_yaml(robot, "test"))
     again = load_robot(tmp_path / "new.yaml", 4)
-    np.testing.assert_allclose(robot_poses(again, five).position, robot_poses(robot, five).position, atol=1e-12)
+    np.testing.assert_allclose(
+        compute_ball_poses(again, five).position, compute_ball_poses(robot, five).position, atol=1e-12
+    )
 
 
 def test_an_equality_of_an_mjcf_couples_joints_or_is_refused(tmp_path):
@@ -184,7 +186,7 @@ def test_an_equality_of_an_mjcf_couples_joints_or_is_refused(tmp_path):
     path.write_text(COUPLED.format('<joint joint1="level" joint2="elbow" polycoef="0.1 -2 0 0 0"/>'))
     robot = load_robot(path, 1)
     # MuJoCo's constraint is level - 0 = 0.1 - 2 (elbow - 0.3).
-    np.testing.assert_allclose(expand_joints(robot, np.array([[0.5]])), [[0.5, 0.1 - 2.0 * 0.2]])
+    np.testing.assert_allclose(expand_mimic_joints(robot, np.array([[0.5]])), [[0.5, 0.1 - 2.0 * 0.2]])
     path.write_text(COUPLED.format('<joint name="e" joint1="level" joint2="elbow" polycoef="0 1 1 0 0"/>'))
     with pytest.raises(InputError, match="the equality constraint e determines the joints level; only a linear"):
         load_robot(path, 1)

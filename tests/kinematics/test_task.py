@@ -9,10 +9,10 @@ from hydrotele.kinematics.task import (
     REACHED,
     SINGULAR,
     arm_parameters,
-    task_forward,
-    task_inverse,
+    compute_joint_rates,
+    compute_tip_pose,
+    solve_joint_angles,
     task_jacobian,
-    task_rates,
 )
 
 FELLER = five_dof.FellerGeometry(
@@ -38,7 +38,7 @@ def angles(k, count=40):
 
 def forward(geometry, q):
     pose = np.zeros(5)
-    task_forward(arm_parameters(geometry), q, pose)
+    compute_tip_pose(arm_parameters(geometry), q, pose)
     return pose
 
 
@@ -62,7 +62,7 @@ def test_inverse_and_rates_go_back(name):
     g, back, out, table = arm_parameters(geometry), np.zeros(k), np.zeros(k), np.zeros((k, k))
     for q in angles(k):
         pose = forward(geometry, q)
-        assert task_inverse(g, pose, q[0], back) == REACHED
+        assert solve_joint_angles(g, pose, q[0], back) == REACHED
         assert np.abs(back - q).max() < 1e-9  # the elbow's sine is at least 0.4 here
         task_jacobian(g, q, table)
         for j in range(k):
@@ -71,21 +71,21 @@ def test_inverse_and_rates_go_back(name):
             assert np.abs(slope - table[:, j]).max() < 1e-8  # central differences of 1e-6
         rate = np.zeros(5)
         rate[:k] = np.array([0.4, -0.2, 0.3, 0.1, -0.3])[:k]
-        assert task_rates(g, q, pose, rate, out) == REACHED
+        assert compute_joint_rates(g, q, pose, rate, out) == REACHED
         assert np.abs(table @ out - rate[:k]).max() < 1e-10
 
 
 def test_beyond_reach_nothing_is_written_and_a_straight_elbow_is_told():
     g, q = arm_parameters(DIGGER), np.full(4, 7.0)
     for r in (30.0, 0.05, np.nan):
-        assert task_inverse(g, np.array([r, 0.0, 1.0, 0.0, 0.0]), 0.0, q) == OUT_OF_REACH
+        assert solve_joint_angles(g, np.array([r, 0.0, 1.0, 0.0, 0.0]), 0.0, q) == OUT_OF_REACH
         assert np.all(q == 7.0)
     straight = np.array([0.0, 0.3, 0.0, -0.5])
-    assert task_rates(g, straight, forward(DIGGER, straight), np.ones(5), q) == SINGULAR
+    assert compute_joint_rates(g, straight, forward(DIGGER, straight), np.ones(5), q) == SINGULAR
 
 
 def test_swing_takes_the_turn_nearest_to_now():
     g, q = arm_parameters(DIGGER), np.zeros(4)
     pose = forward(DIGGER, np.array([3.1, 0.3, -1.2, 0.1]))
-    task_inverse(g, pose, 3.1 + 4 * np.pi, q)
+    solve_joint_angles(g, pose, 3.1 + 4 * np.pi, q)
     assert abs(q[0] - 3.1 - 4 * np.pi) < 1e-9

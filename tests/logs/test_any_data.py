@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.cleaning import find_repeated, readings_per_update
+from hydrotele.logs.cleaning import find_readings_without_update, readings_per_update
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, save_log
@@ -133,7 +133,7 @@ def test_a_clock_that_runs_apart_refreshes_after_two_or_three_rows():
     held = value[(np.arange(1000) * 0.4 + 0.1).astype(int)]
     every = readings_per_update(held)
     assert every == pytest.approx(2.5, abs=0.02)
-    fresh = ~find_repeated(held, every)
+    fresh = ~find_readings_without_update(held, every)
     assert fresh.sum() == pytest.approx(400, abs=2)
     assert np.array_equal(fresh[1:500], np.diff(held[:500]) != 0.0)
     assert fresh[500:750].sum() == pytest.approx(100, abs=2)

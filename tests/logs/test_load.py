@@ -15,9 +15,9 @@ from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.logs.rows import estimate_clock_offset, fit_clock
-from hydrotele.machine.machine import IDEAL_SENSORS, noise_rms
+from hydrotele.machine.machine import IDEAL_SENSORS, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_unit
+from hydrotele.machine.signals import default_channel_unit
 from hydrotele.simulate.feedback import simulate_readings
 from tests.measured import MEASURED, REAL, needs_real
 
@@ -51,7 +51,7 @@ def made_up(seed: int = 0, seconds: float = 20.0, rate: float = 50.0, sensors=SE
     columns = {f"command.{a}": np.rint(2048 * wave(0.0, 0.8)) / 2048 for a in AXES}
     columns |= simulate_readings(CAT, sensors, seed, truth)
     stated = {"machine": "cat215", "tool": "none", "sensors": "khoshzaban1992"}
-    return Log(time, columns, {c: default_unit(c) for c in columns}, stated, "made up")
+    return Log(time, columns, {c: default_channel_unit(c) for c in columns}, stated, "made up")
 
 
 def changed(log: Log, **channels) -> Log:
@@ -141,7 +141,7 @@ def test_true_values_have_unknown_noise_and_no_stuck_sensor():
 
 def test_noise_is_that_of_the_sensors():
     data = dataset(a=made_up(1), b=made_up(2))
-    assert data.noise == pytest.approx([noise_rms(CAT, SENSORS, c) for c in data.channels])
+    assert data.noise == pytest.approx([reading_noise_rms(CAT, SENSORS, c) for c in data.channels])
     better = make_dataset([RunFiles("a", (made_up(1),)), RunFiles("b", (made_up(2),))], CAT,
                           "khoshzaban1992_improved")  # fmt: skip
     assert better.noise[-1] < 0.25 * data.noise[-1]
@@ -487,7 +487,7 @@ def test_infinite_and_missing_readings_in_memory():
 def test_a_run_at_rest_is_said():
     log = made_up(1)
     still = {c.replace(".", "_"): np.full(len(log), np.median(log[c]))
-             + noise_rms(CAT, SENSORS, c) * np.random.default_rng(k).uniform(-1.7, 1.7, len(log))
+             + reading_noise_rms(CAT, SENSORS, c) * np.random.default_rng(k).uniform(-1.7, 1.7, len(log))
              for k, c in enumerate(log.columns) if c.startswith(("angle", "length"))}  # fmt: skip
     data = dataset(a=changed(log, **still), b=made_up(2))
     assert data.notes == ("a: nothing moves; friction, inertia and delays are not identifiable.",)

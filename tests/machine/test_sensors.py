@@ -9,18 +9,18 @@ from scipy import stats
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import (
     Sensor,
-    channel_converter,
-    channel_sensor,
-    get_sensors,
-    noise_rms,
+    find_channel_sensor,
+    get_sensor_set,
+    make_channel_converter,
+    reading_noise_rms,
 )
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import prepare, run_scenario
+from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.feedback import (
     _quantise_readings,
     create_feedback,
-    sensor_errors,
+    sample_sensor_errors,
     simulate_readings,
 )
 from hydrotele.simulate.stepping import Stepper
@@ -34,7 +34,7 @@ def run():
 
 def sensor_of(run, channel):
     machine = run.plant.machine
-    return channel_sensor(machine, get_sensors(machine, run.scenario.sensors), channel)
+    return find_channel_sensor(machine, get_sensor_set(machine, run.scenario.sensors), channel)
 
 
 def measurable(run):
@@ -68,14 +68,14 @@ def test_scatter_is_that_of_the_specification(run):
         assert error.std() == pytest.approx(expected, rel=0.05)
         assert abs(error.mean()) < 4 * expected / math.sqrt(len(error))
         machine = run.plant.machine
-        stated = noise_rms(machine, get_sensors(machine, "khoshzaban1992"), channel)
+        stated = reading_noise_rms(machine, get_sensor_set(machine, "khoshzaban1992"), channel)
         assert stated == pytest.approx(expected, rel=0.005)  # three digits are given
 
 
 def test_errors_are_uniform():
     """Kolmogorov-Smirnov at p > 0.01 for one fixed seed; a normal distribution fails it."""
     sensor = Sensor(accuracy=2.0)
-    errors = sensor_errors(sensor, 7, "angle.boom", 20000)
+    errors = sample_sensor_errors(sensor, 7, "angle.boom", 20000)
     assert stats.kstest(errors, stats.uniform(-2.0, 4.0).cdf).pvalue > 0.01
     normal = np.random.default_rng(7).normal(0, 2.0 / math.sqrt(3), 20000)
     assert stats.kstest(normal, stats.uniform(-2.0, 4.0).cdf).pvalue < 1e-6
@@ -84,16 +84,16 @@ def test_errors_are_uniform():
 def test_errors_are_white_and_independent():
     """Correlations of 20000 samples stay below 4 / sqrt(n)."""
     sensor, n = Sensor(accuracy=1.0), 20000
-    boom, stick = (sensor_errors(sensor, 7, f"angle.{a}", n) for a in ("boom", "stick"))
+    boom, stick = (sample_sensor_errors(sensor, 7, f"angle.{a}", n) for a in ("boom", "stick"))
     assert abs(np.corrcoef(boom, stick)[0, 1]) < 4 / math.sqrt(n)
     assert abs(np.corrcoef(boom[1:], boom[:-1])[0, 1]) < 4 / math.sqrt(n)
-    other = sensor_errors(sensor, 8, "angle.boom", n)
+    other = sample_sensor_errors(sensor, 8, "angle.boom", n)
     assert abs(np.corrcoef(boom, other)[0, 1]) < 4 / math.sqrt(n)
 
 
 def test_leaving_out_channels_changes_no_other():
     machine = load_machine("cat215")
-    sensors = get_sensors(machine, "khoshzaban1992")
+    sensors = get_sensor_set(machine, "khoshzaban1992")
     names = ["angle.boom", "length.boom", "pressure_head.boom", "pressure_supply"]
     truth = {name: np.full(50, 0.5) for name in names}
     whole = simulate_readings(machine, sensors, 3, truth)
@@ -103,21 +103,21 @@ def test_leaving_out_channels_changes_no_other():
 
 def test_longer_run_begins_like_the_shorter_one():
     sensor = Sensor(accuracy=1.0)
-    longer = sensor_errors(sensor, 3, "angle.boom", 100)
-    assert np.array_equal(longer[:40], sensor_errors(sensor, 3, "angle.boom", 40))
+    longer = sample_sensor_errors(sensor, 3, "angle.boom", 100)
+    assert np.array_equal(longer[:40], sample_sensor_errors(sensor, 3, "angle.boom", 40))
 
 
 def test_converter_ends_and_goes_round():
     """Lengths and pressures end at 0 and the span; an angle goes on."""
     sensor, values = Sensor(bits=4, span=1.6), np.array([-0.3, 0.04, 0.06, 0.149, 9.0])
-    clipped = _quantise_readings(values, *channel_converter(sensor, "pressure_rod.boom"))
+    clipped = _quantise_readings(values, *make_channel_converter(sensor, "pressure_rod.boom"))
     np.testing.assert_allclose(clipped, [0, 0, 0.1, 0.1, 1.6], atol=1e-15)
-    free = _quantise_readings(values, *channel_converter(sensor, "angle.boom"))
+    free = _quantise_readings(values, *make_channel_converter(sensor, "angle.boom"))
     np.testing.assert_allclose(free, [-0.3, 0, 0.1, 0.1, 9], atol=1e-15)
-    assert np.array_equal(_quantise_readings(values, *channel_converter(Sensor(), "length.boom")), values)
+    assert np.array_equal(_quantise_readings(values, *make_channel_converter(Sensor(), "length.boom")), values)
     machine = load_machine("cat215")
     readings = simulate_readings(
-        machine, get_sensors(machine, "khoshzaban1992"), 1,
+        machine, get_sensor_set(machine, "khoshzaban1992"), 1,
         {"length.boom": np.array([-1.0, 5.0]), "pressure_head.boom": np.array([-1e6, 1e9]),
          "angle.swing": np.array([50.0, -50.0])},
     )  # fmt: skip
@@ -128,23 +128,23 @@ def test_converter_ends_and_goes_round():
 
 def test_length_spans_its_own_stroke():
     machine = load_machine("cat215", "bucket")
-    sensors = get_sensors(machine, "khoshzaban1992")
+    sensors = get_sensor_set(machine, "khoshzaban1992")
     for axis in ("boom", "stick", "bucket"):
         stroke = machine.axes[axis].cylinder.stroke
-        assert channel_sensor(machine, sensors, f"length.{axis}").span == stroke
+        assert find_channel_sensor(machine, sensors, f"length.{axis}").span == stroke
 
 
 def test_ideal_and_unknown_sensors():
     machine = load_machine("cat215")
-    assert get_sensors(machine, "ideal") is None
-    assert noise_rms(machine, None, "angle.boom") == 0.0
+    assert get_sensor_set(machine, "ideal") is None
+    assert reading_noise_rms(machine, None, "angle.boom") == 0.0
     with pytest.raises(InputError, match="did you mean 'khoshzaban1992'"):
-        get_sensors(machine, "khoshzaban92")
+        get_sensor_set(machine, "khoshzaban92")
 
 
 def test_slow_sensors_are_held_for_the_controller():
     """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
-    plant, data, _, seen = prepare(load_scenario("zhu_up"))
+    plant, data, _, seen = prepare_run(load_scenario("zhu_up"))
     assert seen.ticks_per_sample == 4 and seen.period == pytest.approx(0.02)
     readings, stepper = [], Stepper(plant, data, 5)
     for tick in range(9):
@@ -159,7 +159,7 @@ def test_slow_sensors_are_held_for_the_controller():
 def test_the_log_shows_what_the_controller_saw():
     """Feedback and log share sampling, errors and converter, clipped pressures included."""
     scenario = load_scenario("steps", {"duration": "3.0"})
-    plant, data, _, seen = prepare(scenario)
+    plant, data, _, seen = prepare_run(scenario)
     seen.update(0, Stepper(plant, data, 5))
     log = run_scenario(scenario).measured
     for i, axis in enumerate(plant.axes):
@@ -171,9 +171,9 @@ def test_the_log_shows_what_the_controller_saw():
 
 def test_a_log_faster_than_its_sensors_is_refused():
     with pytest.raises(InputError, match="sample rate 50 Hz must be a multiple of log_rate 200 Hz"):
-        prepare(load_scenario("zhu_up", {"log_rate": "200"}))
+        prepare_run(load_scenario("zhu_up", {"log_rate": "200"}))
     with pytest.raises(InputError, match="the sampling rate of 50 Hz must divide 125 Hz"):
-        prepare(load_scenario("zhu_up", {"control_rate": "125", "log_rate": "25"}))
+        prepare_run(load_scenario("zhu_up", {"control_rate": "125", "log_rate": "25"}))
 
 
 def test_a_drifting_sensor_warms_up_in_logs_and_in_what_the_controller_sees():

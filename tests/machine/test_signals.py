@@ -39,7 +39,7 @@ def test_every_kind_survives_naming_and_parsing(kind_and_truth, axis):
     name = signals.channel_name(kind, axis, truth=truth)
     assert signals.parse_channel(name) == (kind, axis, truth)
     assert signals.parse_channel(name).name == name
-    assert signals.default_unit(name) in signals.allowed_units(name)
+    assert signals.default_channel_unit(name) in signals.allowed_channel_units(name)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_a_wrong_name_is_answered_with_the_right_one(name, hint):
 
 @given(st.text(max_size=30))
 def test_any_text_parses_or_is_a_value_error(name):
-    signals.close_matches(name)
+    signals.suggest_channel_names(name)
     try:
         assert signals.parse_channel(name).name == name
     except ValueError:
@@ -95,20 +95,20 @@ def test_any_text_parses_or_is_a_value_error(name):
     ],
 )
 def test_allowed_units(name, units):
-    assert signals.allowed_units(name) == units
+    assert signals.allowed_channel_units(name) == units
 
 
 def test_usual_unit_follows_the_joint():
-    assert signals.default_unit("reference.slide") == "rad"
-    assert signals.default_unit("reference.slide", ["position.slide"]) == "m"
-    assert signals.default_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
-    assert signals.default_unit("command.slide", ["position.slide"]) == "1"
+    assert signals.default_channel_unit("reference.slide") == "rad"
+    assert signals.default_channel_unit("reference.slide", ["position.slide"]) == "m"
+    assert signals.default_channel_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
+    assert signals.default_channel_unit("command.slide", ["position.slide"]) == "1"
 
 
 def test_limits_are_wider_where_the_unit_is_stated():
     for unit in ("rad", "rad/s", "m", "m/s", "Pa", "N"):
-        stated = signals.magnitude_limits("angle.boom", unit)
-        unstated = signals.magnitude_limits("angle.boom", unit, stated=False)
+        stated = signals.plausible_magnitude_limits("angle.boom", unit)
+        unstated = signals.plausible_magnitude_limits("angle.boom", unit, stated=False)
         assert stated.min_magnitude <= unstated.min_magnitude
         assert stated.max_magnitude >= unstated.max_magnitude
 

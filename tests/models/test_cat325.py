@@ -12,7 +12,7 @@ from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.closure import compute_loop_closure_error
 from hydrotele.simulate.plant import build_plant, rest_state
 
 CAT = load_machine("cat325")
@@ -49,7 +49,7 @@ def test_numbers_are_those_of_zhu():
     ):  # fmt: skip
         head = count * math.pi / 4 * bore**2
         ring = count * math.pi / 4 * (bore**2 - rod**2)
-        assert CAT.axes[name].cylinder.areas == pytest.approx((head, ring), rel=1e-5)
+        assert CAT.axes[name].cylinder.effective_areas == pytest.approx((head, ring), rel=1e-5)
     swing = CAT.axes["swing"].motor.displacement * CAT.supply.relief_pressure
     assert swing == pytest.approx(86300, rel=1e-4)
 
@@ -255,7 +255,7 @@ def test_nothing_warns_with_the_saw_at_speed_on_the_ground():
             up = 1.0 if (k // 500) % 3 else -1.0
             data.ctrl[hydraulic] = [up, up, -up, up, -up, up]
         mujoco.mj_step(plant.model, data)
-        opening = max(opening, pin_opening(plant.model, data))
+        opening = max(opening, compute_loop_closure_error(plant.model, data))
         touched += data.ncon > 0
     assert touched, "it did not come down"
     assert opening < 1e-4
@@ -302,7 +302,7 @@ def test_a_pin_that_sits_elsewhere_is_moved_across_itself(axis, ways):
     plant = build_plant(moved, ground=False)
     data = rest_state(plant)
     mujoco.mj_kinematics(plant.model, data)
-    assert pin_opening(plant.model, data) < 1e-9  # loops are closed to 1e-12 m
+    assert compute_loop_closure_error(plant.model, data) < 1e-9  # loops are closed to 1e-12 m
     found = data.body(f"{axis}_tube").xpos - data.body(CAT.axes[axis].cylinder.base_pin.link).xpos
     nominal = CAT.axes[axis].cylinder.base_pin.position
     assert abs(np.linalg.norm(found) - np.linalg.norm(nominal)) > 1e-3

@@ -8,13 +8,13 @@ from hydrotele.core.files import models_folder
 from hydrotele.kinematics.hybrid import (
     PlatformPose,
     UnreachableError,
-    apply_errors,
+    apply_geometry_errors,
     build_error_model,
     forward_kinematics,
     load_hybrid,
     pose_difference,
 )
-from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.closure import compute_loop_closure_error
 from hydrotele.simulate.hybrid import (
     build_hybrid_mechanism,
     sample_manufacturing_errors,
@@ -28,7 +28,7 @@ FILE = models_folder() / "iwr" / "iwr.xml"
 
 def robots():
     model = build_error_model(IWR, "dh")
-    return IWR, apply_errors(model, sample_manufacturing_errors(model, np.random.default_rng(7)))
+    return IWR, apply_geometry_errors(model, sample_manufacturing_errors(model, np.random.default_rng(7)))
 
 
 def test_file_is_what_the_numbers_make():
@@ -72,4 +72,4 @@ def test_it_steps_with_noise_without_warnings_and_its_loops_stay_closed():
         mujoco.mj_step(model, data)
     assert data.warning.number.sum() == 0
     mujoco.mj_kinematics(model, data)
-    assert pin_opening(model, data) < 1e-5  # m: a tenth of the accuracy that the robot is for
+    assert compute_loop_closure_error(model, data) < 1e-5  # m: a tenth of the accuracy that the robot is for

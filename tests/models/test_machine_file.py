@@ -14,12 +14,12 @@ from hydrotele.core import datafile
 from hydrotele.core.datafile import read_yaml, split_unit, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.core.units import KEY_SUFFIXES, PSI, to_si
+from hydrotele.core.units import KEY_SUFFIXES, PSI, si_unit_and_factor
 from hydrotele.kinematics.from_machine import check_strokes
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
+    find_machine_file,
     load_machine,
-    machine_path,
     save_machine,
     shipped_machines,
 )
@@ -158,7 +158,7 @@ def test_unit_suffixes_have_their_definitions():
 @given(st.sampled_from(list(KEY_SUFFIXES)), st.from_regex(r"[a-z]{1,8}", fullmatch=True))
 def test_split_unit_takes_the_suffix_off(suffix, stem):
     """Any stem, any suffix."""
-    assert split_unit(stem + suffix) == (stem, to_si(KEY_SUFFIXES[suffix])[1])
+    assert split_unit(stem + suffix) == (stem, si_unit_and_factor(KEY_SUFFIXES[suffix])[1])
     assert split_unit(stem) == (stem, None)
 
 
@@ -356,9 +356,9 @@ def test_unknown_machine_lists_the_shipped_ones(tmp_path):
     """Name, folder without a machine file, and file that is not there."""
     for name in ("cat21", tmp_path):
         with pytest.raises(InputError, match="cat215.*ec20.*emps.*rig"):
-            machine_path(name)
+            find_machine_file(name)
     with pytest.raises(InputError, match="no such machine file"):
-        machine_path(tmp_path / "gone.yaml")
+        find_machine_file(tmp_path / "gone.yaml")
     assert {"cat215", "ec20", "emps", "rig"} <= set(shipped_machines())
 
 

@@ -10,7 +10,7 @@ import pytest
 from hydrotele.core.files import models_folder
 from hydrotele.machine.machine_file import load_machine, shipped_machines
 from hydrotele.machine.signals import parse_channel
-from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis, pin_opening
+from hydrotele.simulate.closure import compute_loop_closure_error, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.measured import REAL, needs_real
 
@@ -61,7 +61,7 @@ def test_steps_under_noise_without_warning(plant):
         if step % 50 == 0:
             data.ctrl[:] = limit * rng.uniform(-1.0, 1.0, plant.model.nu)
         mujoco.mj_step(plant.model, data)
-        opening = max(opening, pin_opening(plant.model, data))
+        opening = max(opening, compute_loop_closure_error(plant.model, data))
     assert no_warnings(data)
     assert opening < PIN
     assert np.all(np.isfinite(data.qpos)) and np.all(np.isfinite(data.act))
@@ -75,7 +75,7 @@ def test_rests_in_equilibrium(plant):
     0.1 m/s^2.
     """
     data = rest_state(plant)
-    assert pin_opening(plant.model, data) < 1e-9  # Newton closes to 1e-12, see closure.py
+    assert compute_loop_closure_error(plant.model, data) < 1e-9  # Newton closes to 1e-12, see closure.py
     mujoco.mj_forward(plant.model, data)
     assert np.abs(data.qacc).max() < 0.2
     assert not np.any(data.qvel)
@@ -123,7 +123,7 @@ def test_linkages_close_over_the_joint_range_within_the_stroke(plant):
     """Every cylinder reaches its joint's whole range within its stroke, to the loops' 1e-9 m."""
     for axis, value, data in samples(plant):
         where = f"{axis.joint} at {value:.3f}"
-        assert pin_opening(plant.model, data) < 1e-9, where
+        assert compute_loop_closure_error(plant.model, data) < 1e-9, where
         for place, name in zip(plant.rod_qpos, plant.axes, strict=True):
             cylinder = plant.machine.axes[name].cylinder
             if cylinder:

@@ -79,7 +79,7 @@ def test_refusals(chain):
 
 
 def test_a_pendulum_compiles_what_machines_need(chain):
-    closures.compile_openings()
+    closures.precompile_loop_residuals()
     count = len(closures._loop_residuals.signatures)  # one kind of arguments, for all trees
     closures.close_loops_from(chain.tree, np.array(chain.start), np.arange(3), 1e-9, 1.0)
     assert len(closures._loop_residuals.signatures) == count == 1

@@ -9,7 +9,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import with_value
 from hydrotele.hydraulics.laws import friction_force
-from hydrotele.identify.estimation import estimate
+from hydrotele.identify.estimation import estimate_linear_parameters
 from hydrotele.identify.identifiability import classify_parameters, reference_sizes
 from hydrotele.identify.setup import drive_friction_terms, machine_setup
 from hydrotele.machine.machine_file import load_machine
@@ -111,7 +111,7 @@ def test_noise_free_forces_of_mujoco_tell_every_combination_exactly():
     flat = found.matrix.reshape(-1, found.matrix.shape[2])
     told = classify_parameters(flat, found.names, found.units)
     assert len(told.base) > 40
-    base = estimate(found.matrix[:, :, told.base], np.array(forces), order=0)
+    base = estimate_linear_parameters(found.matrix[:, :, told.base], np.array(forces), order=0)
     truth = told.combination @ found.nominal
     # relative to the body's own mass, radius and inertia: many of the true numbers are 0
     setup = machine_setup(machine, closed_chain(machine)[0])

@@ -9,7 +9,7 @@ from hydrotele.cli.driving import DriveOptions, drive_to_folder
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.server import DEFAULT_PORT
 from hydrotele.logs.log import load_log
-from hydrotele.run.live import haptic_address
+from hydrotele.run.live import parse_haptic_address
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 
@@ -17,13 +17,13 @@ WISHES = DriveOptions(None, {}, "keyboard", None, False, None, 1.0, False, True)
 
 
 def test_addresses():
-    assert haptic_address("haptic") == ("127.0.0.1", DEFAULT_PORT)
-    assert haptic_address("haptic:lab") == ("lab", DEFAULT_PORT)
-    assert haptic_address("haptic:10.0.0.7:6000") == ("10.0.0.7", 6000)
+    assert parse_haptic_address("haptic") == ("127.0.0.1", DEFAULT_PORT)
+    assert parse_haptic_address("haptic:lab") == ("lab", DEFAULT_PORT)
+    assert parse_haptic_address("haptic:10.0.0.7:6000") == ("10.0.0.7", 6000)
     for wrong in ("haptic:", "haptic::6000", "haptic:a:b", "haptic:a:0", "haptic:a:70000",
                   "haptic:a:1:2", "haptics"):  # fmt: skip
         with pytest.raises(InputError, match="must be haptic, haptic:HOST or haptic:HOST:PORT"):
-            haptic_address(wrong)
+            parse_haptic_address(wrong)
 
 
 @pytest.mark.parametrize(

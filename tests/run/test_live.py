@@ -10,7 +10,7 @@ from hydrotele.cli.driving import DriveOptions, catch_first_interrupt, drive_to_
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import load_log
 from hydrotele.run.devices import Reading
-from hydrotele.run.live import MAX_LATENESS, Pacer, additional_axes, drive_scenario
+from hydrotele.run.live import MAX_LATENESS, Pacer, axes_not_moved_by_joystick, drive_scenario
 from hydrotele.run.run import load_simulated_machine, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 
@@ -133,7 +133,7 @@ def test_buttons_of_the_feller_and_their_repetition():
     """The saw spins up, the grab closes; the notes and the repeating scenario know of it."""
     scenario = load_scenario("fell_tree", {"duration": "3"})
     machine = load_simulated_machine(scenario)
-    assert additional_axes(machine) == {"grab": 1.0, "saw": 1.0}
+    assert axes_not_moved_by_joystick(machine) == {"grab": 1.0, "saw": 1.0}
     device = Script(
         (0.0, Reading(commands=(0.0, 0.0))),
         (0.1, Reading(commands=(0.0, 1.0))),

@@ -15,7 +15,7 @@ from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.run.run import (
     finish_run,
     load_simulated_machine,
-    prepare,
+    prepare_run,
     run_scenario,
     start_session,
 )
@@ -181,7 +181,7 @@ def test_table_from_csv_drives_joints(tmp_path):
     (tmp_path / "r.csv").write_text("\n".join([header, *rows]))
     pilot = {"quantity": "joint", "interpolate": "linear"}
     scenario = load_scenario(table_of("r.csv", tmp_path, pilot=pilot, duration=1.0))
-    plan = prepare(scenario).plan
+    plan = prepare_run(scenario).plan
     boom = plan.reference[:, plan.axes.index("boom")]
     np.testing.assert_allclose(boom, np.radians(20 + 10 * plan.time), atol=1e-12)
     assert plan.reference[0, plan.axes.index("stick")] == pytest.approx(np.radians(-86))
@@ -208,7 +208,7 @@ def test_table_of_a_log_that_starts_late_starts_at_once(tmp_path):
 def test_bad_table_files(text, message, tmp_path):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(InputError, match=message):
-        prepare(load_scenario(table_of("t.csv", tmp_path)))
+        prepare_run(load_scenario(table_of("t.csv", tmp_path)))
 
 
 def test_missing_table_file_names_scenario_line_and_file(tmp_path):
@@ -262,7 +262,7 @@ def test_books_of_a_run_with_contact_claim_nothing():
 
 def _books(change=None, swap=None):
     """The audit of two seconds of motion, after forging the model or the machine."""
-    plant, data, *_ = prepare(load_scenario("excitation", {"duration": "2"}))
+    plant, data, *_ = prepare_run(load_scenario("excitation", {"duration": "2"}))
     start_leapfrog(plant.model, data)
     start = full_physics_state(plant.model, data)
     window = np.zeros((2000, plant.model.nu))

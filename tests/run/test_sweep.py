@@ -18,14 +18,14 @@ from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import save_log
 from hydrotele.run import sweep_runs as running
 from hydrotele.run.run import run_scenario
-from hydrotele.run.sweep import SweepSettings, run_in_processes, run_sweep, sweep_folder
+from hydrotele.run.sweep import SweepSettings, open_sweep_folder, run_in_processes, run_sweep
 from hydrotele.run.sweep_facts import (
     check_points,
     iterate_points,
     load_sweep,
-    open_base,
+    make_point_scenario,
     point_overrides,
-    scenario_of,
+    read_base_scenario,
 )
 from hydrotele.run.sweep_runs import (
     FAILED,
@@ -136,8 +136,8 @@ def test_a_failed_run_says_why(error, reason, monkeypatch, tmp_path):
         raise error
 
     monkeypatch.setattr(running, "run_scenario", fail)
-    base = open_base(load_sweep(write_sweep(tmp_path)))
-    scenario = scenario_of(base, next(iterate_points(base.file.sweep)))
+    base = read_base_scenario(load_sweep(write_sweep(tmp_path)))
+    scenario = make_point_scenario(base, next(iterate_points(base.file.sweep)))
     outcome = execute_task(RunTask(7, scenario, str(tmp_path), {}, None, str(tmp_path)))
     assert outcome.entry == JournalEntry(7, FAILED, reason)
 
@@ -178,8 +178,8 @@ def test_another_sweep_is_refused_with_what_differs(done, tmp_path):
     with pytest.raises(InputError, match=r"grid.servo.lead was \[0.0, 0.05\], is \[0.0, 0.06\]"):
         run_sweep(load_sweep(file), out)
     assert (out / "table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
-    base = open_base(load_sweep(file))
-    with sweep_folder(out, base, check_points(base), fresh=True):
+    base = read_base_scenario(load_sweep(file))
+    with open_sweep_folder(out, base, check_points(base), fresh=True):
         assert sorted(p.name for p in out.iterdir()) == [".scratch", "summary.json", "sweep.yaml"]
         with pytest.raises(InputError, match="in use by another hydrotele sweep"):
             run_sweep(load_sweep(file), out)
@@ -210,9 +210,9 @@ def own(tmp_path) -> Path:
 
 
 def test_a_machine_of_ones_own_travels_as_content(own, tmp_path):
-    base = open_base(load_sweep(own))
+    base = read_base_scenario(load_sweep(own))
     checked = check_points(base)
-    mine, shipped = (scenario_of(base, point) for point in iterate_points(base.file.sweep))
+    mine, shipped = (make_point_scenario(base, point) for point in iterate_points(base.file.sweep))
     files = base.machine_copies.files_of(mine)
     assert sorted(Path(name).name for name in files) == ["machine.yaml", "rig.xml"]
     assert base.machine_copies.files_of(shipped) == {}
@@ -226,7 +226,7 @@ def test_a_machine_of_ones_own_travels_as_content(own, tmp_path):
     for name, content in files.items():
         changed = content.replace(b"name: rig", b"name: rag")
         (tmp_path / "mine" / Path(name).name).write_bytes(changed)
-    assert check_points(open_base(load_sweep(own))).digest != checked.digest
+    assert check_points(read_base_scenario(load_sweep(own))).digest != checked.digest
 
 
 def test_a_machine_with_further_files_is_refused_on_a_cluster(own, tmp_path):
@@ -247,8 +247,8 @@ def test_all_numbers_that_runs_have_are_known_beforehand():
 
 @pytest.mark.nightly
 def test_a_killed_process_costs_its_run_alone(tmp_path):
-    base = open_base(load_sweep(write_sweep(tmp_path)))
-    quick = [scenario_of(base, point) for point in list(iterate_points(base.file.sweep))[:2]]
+    base = read_base_scenario(load_sweep(write_sweep(tmp_path)))
+    quick = [make_point_scenario(base, point) for point in list(iterate_points(base.file.sweep))[:2]]
     endless = quick[0].model_copy(update={"duration": 3600.0, "control_rate": 1000.0})
     scenarios = [quick[0], endless, quick[1]]
     tasks = [RunTask(k, s, str(tmp_path), {}, None, str(tmp_path)) for k, s in enumerate(scenarios)]

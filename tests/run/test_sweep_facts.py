@@ -4,7 +4,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
-from hydrotele.run.sweep_facts import MAX_RUNS, check_points, load_sweep, open_base, shipped_sweeps
+from hydrotele.run.sweep_facts import MAX_RUNS, check_points, load_sweep, read_base_scenario, shipped_sweeps
 from hydrotele.scenario.scenario import shipped_scenarios
 
 EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100}}]}\n"
@@ -70,7 +70,7 @@ def test_what_is_wrong_is_said_before_the_first_run(text, place, message, tmp_pa
     path = tmp_path / "bad.yaml"
     path.write_text(f"scenario: zhu_up\n{text}\n")
     with pytest.raises(InputError, match=message) as error:
-        check_points(open_base(load_sweep(path)))
+        check_points(read_base_scenario(load_sweep(path)))
     assert str(error.value).startswith(f"{path}{place}")
 
 
@@ -99,7 +99,7 @@ def test_files_that_are_no_sweep(text, message, tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
-        open_base(load_sweep(path))
+        read_base_scenario(load_sweep(path))
     assert error.value.where.startswith(str(path))
     with pytest.raises(InputError, match="did you mean 'servo_gains'"):
         load_sweep("servo_gain")
@@ -109,7 +109,7 @@ def test_a_scenario_beside_the_file_is_found(tmp_path):
     text = (scenarios_folder() / "hold.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(text)
     (tmp_path / "sweep.yaml").write_text("scenario: mine.yaml\ngrid: {duration: [1, 2]}\n")
-    base = open_base(load_sweep(tmp_path / "sweep.yaml"))
+    base = read_base_scenario(load_sweep(tmp_path / "sweep.yaml"))
     assert len(check_points(base).fingerprints) == 2
 
 
@@ -118,4 +118,4 @@ def test_shipped_sweeps_are_right_and_no_scenarios():
     for name in shipped_sweeps():
         file = load_sweep(name)
         assert file.name == name and file.sweep.description
-        assert len(check_points(open_base(file)).fingerprints) == file.sweep.runs
+        assert len(check_points(read_base_scenario(file)).fingerprints) == file.sweep.runs

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import finish_run, prepare, run_scenario, start_session
+from hydrotele.run.run import finish_run, prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, shipped_scenarios
-from hydrotele.simulate.closure import pin_opening
+from hydrotele.simulate.closure import compute_loop_closure_error
 from hydrotele.simulate.record import SimulationFailed
 
 DATA = Path(__file__).parents[1] / "data"
@@ -53,7 +53,7 @@ def watched(name, seconds):
     worst = [0.0]
 
     def look(model, data):  # positions are those that the step before left
-        worst[0] = max(worst[0], pin_opening(model, data))
+        worst[0] = max(worst[0], compute_loop_closure_error(model, data))
 
     asked = load_scenario(name)
     asked = load_scenario(name, {"duration": str(min(seconds, asked.duration))})
@@ -95,7 +95,7 @@ def test_shipped_scenario_lasts_until_its_pilot_is_done(name):
     """The plan of the full duration has no notes; a pilot that is cut short is one."""
     asked = load_scenario(name)
     assert asked.description and asked.name == name
-    assert not prepare(asked).plan.notes
+    assert not prepare_run(asked).plan.notes
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_dig_fills_the_bucket_and_leaves_a_trench():
 
 def test_soil_needs_a_bucket_and_ground():
     with pytest.raises(InputError, match="cat215 with tool none has no bucket to dig with"):
-        prepare(load_scenario("dig", {"tool": "none", "pilot": "{kind: constant, commands: {}}", "start": "{}"}))
+        prepare_run(load_scenario("dig", {"tool": "none", "pilot": "{kind: constant, commands: {}}", "start": "{}"}))
     with pytest.raises(InputError, match="soil can be given once, and only with ground: true"):
         load_scenario("dig", {"ground": "false"})
 
@@ -331,10 +331,10 @@ def test_machine_beside_the_scenario_is_found_from_anywhere(tmp_path):
     write(tmp_path / "a" / "s.yaml", machine="mine", tool=None)
     write(tmp_path / "b" / "s.yaml", machine="rig", tool=None)
     first = load_scenario(tmp_path / "a" / "s.yaml")
-    assert prepare(first).plant.machine.name == "mine"
+    assert prepare_run(first).plant.machine.name == "mine"
     save_scenario(first, tmp_path / "b" / "resolved.yaml")
-    assert prepare(load_scenario(tmp_path / "b" / "resolved.yaml")).plant.machine.name == "mine"
-    assert prepare(load_scenario(tmp_path / "b" / "s.yaml")).plant.machine.name == "rig"
+    assert prepare_run(load_scenario(tmp_path / "b" / "resolved.yaml")).plant.machine.name == "mine"
+    assert prepare_run(load_scenario(tmp_path / "b" / "s.yaml")).plant.machine.name == "rig"
 
 
 def write(path, **facts):
@@ -468,7 +468,7 @@ def test_refused_with_the_reason(case, tmp_path):
     facts, message = REFUSED[case]
     path = write(tmp_path / "s.yaml", **facts)
     with pytest.raises(InputError, match=f"(?s){message}"):
-        prepare(load_scenario(path))
+        prepare_run(load_scenario(path))
 
 
 def test_errors_name_file_and_line(tmp_path):
@@ -644,7 +644,7 @@ def test_garbage_is_refused_politely(examples, tmp_path):
         base = {"name": "t", "duration": 0.5, "pilot": {"kind": "constant"}} if usual else {}
         path.write_text(yaml.safe_dump(base | facts))
         try:
-            prepare(load_scenario(path))
+            prepare_run(load_scenario(path))
         except InputError as error:
             assert str(error)
 
@@ -661,4 +661,4 @@ def test_quoted_numbers_with_units_are_refused():
 
 def test_a_pose_and_its_joints_are_not_given_twice():
     with pytest.raises(InputError, match="either a pose or the joints boom, not both"):
-        prepare(load_scenario("zhu_up", {"start.joints.boom": "0.3"}))
+        prepare_run(load_scenario("zhu_up", {"start.joints.boom": "0.3"}))

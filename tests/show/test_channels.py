@@ -8,11 +8,11 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.signals import MEASURED_KINDS, TRUTH_KINDS
 from hydrotele.show.channels import (
     TITLES,
-    colours,
-    difference,
+    assign_axis_colours,
+    compute_channel_difference,
     group_channels,
     padded_range,
-    scaled_channel,
+    scale_channel_for_plot,
 )
 
 
@@ -31,7 +31,7 @@ def test_every_kind_has_a_title():
     ],
 )
 def test_channels_are_shown_in_the_units_of_the_field(log, name, unit, factor):
-    trace = scaled_channel(log, name)
+    trace = scale_channel_for_plot(log, name)
     assert trace.unit == unit
     assert trace.values == pytest.approx(factor * log[name], rel=1e-12)
 
@@ -42,17 +42,17 @@ def test_truth_stands_back_where_it_was_measured():
 
 
 def test_an_axis_keeps_its_colour_with_more_recorded(log):
-    assert colours([log]).items() >= colours([log.without_truth()]).items()
+    assert assign_axis_colours([log]).items() >= assign_axis_colours([log.without_truth()]).items()
 
 
 def test_a_log_does_not_differ_from_itself(log):
-    time, trace = difference(log, log, "angle.boom")
+    time, trace = compute_channel_difference(log, log, "angle.boom")
     assert np.array_equal(time, log.time) and not trace.values.any()
 
 
 def test_difference_is_taken_on_the_first_clock(make):
     first, other = make(0.1 * np.arange(40)), make(0.05 + 0.01 * np.arange(300), offset=0.1)
-    time, trace = difference(first, other, "angle.boom")
+    time, trace = compute_channel_difference(first, other, "angle.boom")
     assert time[0] == pytest.approx(0.1) and time[-1] == pytest.approx(3.0)
     # linear interpolation is off by h^2/8 times the curvature: 1e-4 / 8 * 0.8 rad
     assert trace.values == pytest.approx(np.degrees(-0.1), abs=np.degrees(2e-5))
@@ -61,7 +61,7 @@ def test_difference_is_taken_on_the_first_clock(make):
 def test_logs_without_common_time_are_refused(log):
     later = Log(log.time + 100, log.columns, log.units)
     with pytest.raises(InputError, match="common clock"):
-        difference(log, later, "angle.boom")
+        compute_channel_difference(log, later, "angle.boom")
 
 
 def test_a_constant_is_not_blown_up_to_noise():

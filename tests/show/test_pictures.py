@@ -10,10 +10,10 @@ from matplotlib.text import Text
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.overlay import _png_figure, plot_log, plot_overlay
-from hydrotele.show.picture import render_picture
+from hydrotele.show.picture import render_machine
 from hydrotele.show.recording import write_recording
-from hydrotele.show.report_html import png, report_figure, svg
-from hydrotele.show.viewer import take_screenshot, web_viewer
+from hydrotele.show.report_html import figure_to_png, open_report_figure, svg
+from hydrotele.show.viewer import serve_web_viewer, take_screenshot
 
 
 def _pixels(path) -> np.ndarray:
@@ -50,7 +50,7 @@ def _drawn(function, *arguments, **options):
 def test_a_picture_shows_a_yellow_machine(tmp_path, camera):
     path = tmp_path / "machine.png"
     machine = load_machine("cat215", tool="none")
-    _drawn(render_picture, machine, path, {"boom": 0.6}, camera=camera, size=(320, 200))
+    _drawn(render_machine, machine, path, {"boom": 0.6}, camera=camera, size=(320, 200))
     assert _size(path) == (320, 200)
     red, green, blue = np.moveaxis(_pixels(path), -1, 0)
     yellow = (red > 120) & (green > 0.5 * red) & (blue < 0.4 * red)
@@ -59,7 +59,7 @@ def test_a_picture_shows_a_yellow_machine(tmp_path, camera):
 
 def test_an_unknown_camera_is_refused_with_the_valid_ones(tmp_path, machine):
     with pytest.raises(InputError, match="overview.*free"):
-        render_picture(machine, tmp_path / "x.png", camera="drone")
+        render_machine(machine, tmp_path / "x.png", camera="drone")
 
 
 def test_a_screenshot_shows_the_recording_without_complaints(tmp_path, recording):
@@ -90,7 +90,7 @@ def test_the_web_viewer_is_served_while_wanted(recording):
     import urllib.error
     import urllib.request
 
-    with web_viewer(recording) as url:
+    with serve_web_viewer(recording) as url:
         with urllib.request.urlopen(url, timeout=10) as answer:
             assert b"rerun" in answer.read().lower()
     with pytest.raises(urllib.error.URLError):
@@ -124,12 +124,12 @@ def test_a_name_with_dollar_signs_is_no_formula(tmp_path):
     with _png_figure(path, (200, 100)) as figure:
         figure.text(0.1, 0.5, r"$\frac{1}{$")
     assert path.stat().st_size > 1000
-    with report_figure(2.0) as figure:
+    with open_report_figure(2.0) as figure:
         axes = figure.subplots()
         axes.loglog([1.0, 1e3], [1.0, 1e3], label=r"$\frac{1}{$")
         axes.legend()
         axes.set_title(r"a$b$")
-        assert png(figure) and svg(figure)
+        assert figure_to_png(figure) and svg(figure)
         labels = axes.get_xticklabels() + axes.get_yticklabels()
         formulas = {t for t in figure.findobj(Text) if "$" in t.get_text() and t.get_parse_math()}
         assert formulas and formulas <= set(labels)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints, point_trajectory
-from hydrotele.simulate.closure import close_along_motion, close_loops, pin_opening
+from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion, point_trajectory
+from hydrotele.simulate.closure import close_along_motion, close_loops, compute_loop_closure_error
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def model(machine):
 
 @pytest.mark.nightly
 def test_following_closes_all_pins_on_the_branch_of_close_loops(machine, model, log):
-    joints, data = logged_joints(machine, log), mujoco.MjData(model)
+    joints, data = extract_joint_motion(machine, log), mujoco.MjData(model)
     assert set(joints) == {"swing", "boom", "stick", "bucket"}
     poses = close_along_motion(machine, model, data, joints)
     assert poses.shape == (len(log), model.nq)
@@ -25,14 +25,14 @@ def test_following_closes_all_pins_on_the_branch_of_close_loops(machine, model, 
         data.qpos[:] = poses[row]
         mujoco.mj_kinematics(model, data)
         # 1e-9 m per component is where Newton stops
-        assert pin_opening(model, data) < 2e-9
+        assert compute_loop_closure_error(model, data) < 2e-9
         close_loops(machine, model, data, {name: v[row] for name, v in joints.items()})
         # the two stop at 1e-9 and 1e-12 m; joints move metres per radian, near a dead centre more
         assert poses[row] == pytest.approx(data.qpos, abs=1e-7)
 
 
 def test_poses_are_those_of_mujoco(machine, model, log):
-    joints, data = logged_joints(machine, log), mujoco.MjData(model)
+    joints, data = extract_joint_motion(machine, log), mujoco.MjData(model)
     poses = body_poses(machine, model, joints)
     row = 31
     close_loops(machine, model, data, {name: v[row] for name, v in joints.items()})

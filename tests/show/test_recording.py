@@ -10,7 +10,7 @@ import pytest
 import rerun as rr
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints
+from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion
 from hydrotele.show.recording import open_recording, write_recording
 
 
@@ -57,7 +57,7 @@ def test_all_channels_are_there(chunks, log):
 
 def test_bodies_move_as_in_mujoco(chunks, machine, log):
     model = compile_visual_model(machine)
-    poses = body_poses(machine, model, logged_joints(machine, log))
+    poses = body_poses(machine, model, extract_joint_motion(machine, log))
     for body in ("boom", "stick_rod", "bucket_coupler"):
         index = model.body(body).id
         chunk = chunks[f"/measured/machine/{body}", False]

@@ -8,10 +8,10 @@ from hydrotele.show import looks as shapes
 from hydrotele.show.looks import body_meshes, geom_colour
 
 _BODIES = {
-    "box": (shapes.box((0.5, 1.0, 1.5)), 6.0),
-    "cylinder": (shapes.cylinder(0.5, 2.0, segments=200), np.pi),
-    "capsule": (shapes.capsule(0.5, 1.0, segments=200), np.pi / 2 + np.pi / 6),
-    "ellipsoid": (shapes.ellipsoid((1.0, 2.0, 3.0), segments=200), 8.0 * np.pi),
+    "box": (shapes.make_box_mesh((0.5, 1.0, 1.5)), 6.0),
+    "cylinder": (shapes.make_cylinder_mesh(0.5, 2.0, segments=200), np.pi),
+    "capsule": (shapes.make_capsule_mesh(0.5, 1.0, segments=200), np.pi / 2 + np.pi / 6),
+    "ellipsoid": (shapes.make_ellipsoid_mesh((1.0, 2.0, 3.0), segments=200), 8.0 * np.pi),
 }
 
 
@@ -39,7 +39,7 @@ def test_triangles_are_wound_like_their_normals(mesh):
 
 
 def test_joined_meshes_keep_their_parts():
-    one, other = shapes.box((1, 1, 1)), shapes.cylinder(1.0, 1.0)
+    one, other = shapes.make_box_mesh((1, 1, 1)), shapes.make_cylinder_mesh(1.0, 1.0)
     turned = shapes.transform_mesh(other, (5.0, 0.0, 0.0), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]))
     both = shapes.join_meshes([one, turned])
     assert _volume(both) == pytest.approx(_volume(one) + _volume(other), rel=1e-12)

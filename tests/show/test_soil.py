@@ -8,9 +8,9 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.run.run import run_scenario
-from hydrotele.scenario.scenario import load_scenario, logged_soil
-from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints, logged_surroundings
-from hydrotele.show.soil import load_mesh, soil_history, surrounding_tiles, trench_mesh
+from hydrotele.scenario.scenario import load_scenario, read_soil_from_log
+from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
+from hydrotele.show.soil import make_bucket_load_mesh, make_ground_around_trench, soil_history, trench_mesh
 from hydrotele.show.video import write_video
 from hydrotele.soil.facts import CARRIED_VOLUME, INNER_WIDTH
 
@@ -24,8 +24,8 @@ def dug():
 def history(dug):
     machine, log = dug.plant.machine, dug.truth
     model = compile_visual_model(machine, surroundings=logged_surroundings(log))
-    poses = body_poses(machine, model, logged_joints(machine, log), log)
-    return soil_history(machine, logged_soil(log)[0], log, poses)
+    poses = body_poses(machine, model, extract_joint_motion(machine, log), log)
+    return soil_history(machine, read_soil_from_log(log)[0], log, poses)
 
 
 def polygon_area(corners):
@@ -43,17 +43,17 @@ def test_soil_computed_from_the_log_is_that_of_the_run(dug, history):
 def test_load_has_the_volume_that_the_bucket_carries(history):
     area = history.bed.state[CARRIED_VOLUME] / history.bed.parameters[INNER_WIDTH]
     assert polygon_area(history.shapes[-1].load) == pytest.approx(area, rel=0.1)  # the heap is a triangle
-    vertices = load_mesh(history, len(history.shapes) - 1).vertices
+    vertices = make_bucket_load_mesh(history, len(history.shapes) - 1).vertices
     width = np.ptp(vertices @ history.axes[1])
     assert width == pytest.approx(history.bed.bucket.inner_width)
-    assert load_mesh(history, 0) is None
+    assert make_bucket_load_mesh(history, 0) is None
 
 
 def test_trench_is_drawn_and_the_ground_has_a_gap_for_it(history):
     mesh, colours = trench_mesh(history.bed, history.shapes[-1])
     assert mesh.vertices[:, 2].min() == pytest.approx(history.bed.surface.min(), abs=0.02)
     assert len(colours) == len(mesh.vertices)
-    ground, _ = surrounding_tiles(history.bed, 20.0, 2.0)
+    ground, _ = make_ground_around_trench(history.bed, 20.0, 2.0)
     middles = ground.vertices.reshape(-1, 3, 3).mean(axis=1)
     areas = np.linalg.norm(np.cross(*np.diff(ground.vertices.reshape(-1, 3, 3), axis=1).swapaxes(0, 1)), axis=1) / 2
     assert areas.sum() == pytest.approx(40.0**2 - 10.0 * history.bed.bucket.width)

@@ -8,8 +8,8 @@ from hydrotele.effects.effect import with_value
 from hydrotele.kinematics.from_machine import axis_linkage, has_ball_ends
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.reduced_mechanism import make_reduced_mechanism
-from hydrotele.simulate.closure import close_loops, holding_forces, pin_opening
-from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document, tilt_joint
+from hydrotele.simulate.closure import close_loops, compute_loop_closure_error, holding_forces
+from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document, tilt_joint_name
 
 TILT = np.radians(1.0)
 
@@ -30,7 +30,7 @@ def placed(tilted):
 def test_only_the_cylinder_of_the_tilted_joint_has_ball_ends(tilted, placed):
     assert [name for name in ("boom", "stick") if has_ball_ends(tilted, name)] == ["boom"]
     joints = [placed[0].joint(k).name for k in range(placed[0].njnt)]
-    assert tilt_joint("boom") in joints and tilt_joint("stick") not in joints
+    assert tilt_joint_name("boom") in joints and tilt_joint_name("stick") not in joints
 
 
 @pytest.mark.parametrize("angle", [-0.3, 0.2, 0.7])
@@ -38,7 +38,7 @@ def test_length_is_that_of_the_closed_chain(tilted, placed, angle):
     """The loop closes to rounding, with the pin-to-pin length of the spatial triangle."""
     model, data = placed
     close_loops(tilted, model, data, {"boom": angle})
-    assert pin_opening(model, data) < 1e-9
+    assert compute_loop_closure_error(model, data) < 1e-9
     linkage, cylinder = axis_linkage(tilted, "boom"), tilted.axes["boom"].cylinder
     rod = data.qpos[model.joint("boom_rod").qposadr[0]]
     assert rod + cylinder.closed_length == pytest.approx(linkage.length(angle), abs=1e-9)

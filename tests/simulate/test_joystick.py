@@ -7,7 +7,7 @@ import pytest
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.simulate.joystick import SimulatedFlotor, joystick_spec
 from hydrotele.teleop.coils import make_three_station_coils
-from hydrotele.teleop.levitation import quaternion_to_vector
+from hydrotele.teleop.levitation import quaternion_to_rotation_vector
 
 JOYSTICK = load_joystick()
 REST = np.zeros(6)
@@ -59,7 +59,7 @@ def test_random_currents_break_nothing():
         data, most = flotor.data, np.zeros(2)
         for _ in range(2000):
             flotor.step(rng.uniform(-4.0, 4.0, 6), REST)
-            turned = np.linalg.norm(quaternion_to_vector(data.qpos[3:7]))
+            turned = np.linalg.norm(quaternion_to_rotation_vector(data.qpos[3:7]))
             most = np.maximum(most, [np.abs(coils_moved(flotor)).max(), turned])
         assert not np.any(data.warning.number) and np.isfinite(data.qpos).all()
         assert 5e-3 < most[0] < 13e-3 and np.deg2rad(7.0) < most[1] < np.deg2rad(14.0), most
@@ -84,7 +84,7 @@ def test_stops_hold_20_newton(axis, way):
         found = coils_moved(flotor)
         assert 5.0e-3 < way * found[axis] < 5.08e-3, found
     else:
-        found = quaternion_to_vector(flotor.data.qpos[3:7])
+        found = quaternion_to_rotation_vector(flotor.data.qpos[3:7])
         assert np.deg2rad(7.0) < way * found[axis - 3] < np.deg2rad(7.05), np.rad2deg(found)
 
 
@@ -214,7 +214,7 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     inside.visual.map.znear = world.visual.map.znear
     cab = world.worldbody.add_body(name="cab", mass=1.0, inertia=[1e9] * 3)
     cab.add_joint(name="swing", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
-    world.attach(inside, frame=cab.add_frame(pos=mount))
+    world.replace_simulated_joystick(inside, frame=cab.add_frame(pos=mount))
     world.option.timestep, world.option.gravity = flotor.model.opt.timestep, [0, 0, -9.81]
     model = world.compile()
     data = mujoco.MjData(model)
@@ -228,5 +228,5 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     far = np.abs(whole[:3]).max()
     assert far > 2e-3  # it was shaken
     assert np.abs(own[:3] - whole[:3]).max() < 0.06 * far, (own, whole)
-    turned = quaternion_to_vector(whole[3:])
-    assert np.abs(quaternion_to_vector(own[3:]) - turned).max() < 0.06 * np.abs(turned).max()
+    turned = quaternion_to_rotation_vector(whole[3:])
+    assert np.abs(quaternion_to_rotation_vector(own[3:]) - turned).max() < 0.06 * np.abs(turned).max()

@@ -10,7 +10,7 @@ from hydrotele.simulate import layout
 @pytest.fixture
 def fresh():
     """Run the checks anew, before and after the test."""
-    caches = (layout.field_offsets, layout.option_offset, layout.verify_layout)
+    caches = (layout.field_offsets, layout.option_offset, layout.verify_struct_offsets)
     for cached in caches:
         cached.cache_clear()
     yield
@@ -19,7 +19,7 @@ def fresh():
 
 
 def test_layout_is_that_of_the_installed_mujoco(fresh):
-    layout.verify_layout()
+    layout.verify_struct_offsets()
 
 
 @pytest.mark.parametrize(
@@ -65,14 +65,14 @@ def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field, shift):
 
     monkeypatch.setattr(layout, "field_offsets", forged)
     with pytest.raises(RuntimeError, match=rf"stores .*{field}.* at other offsets"):
-        layout.verify_layout()
+        layout.verify_struct_offsets()
 
 
 def test_a_moved_option_is_detected(fresh, monkeypatch):
     true = layout.option_offset("timestep")
     monkeypatch.setattr(layout, "option_offset", lambda name: true + 8)
     with pytest.raises(RuntimeError, match="opt.timestep"):
-        layout.verify_layout()
+        layout.verify_struct_offsets()
 
 
 def test_an_unknown_type_is_refused():

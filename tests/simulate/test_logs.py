@@ -6,11 +6,11 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import prepare, run_scenario, start_session
+from hydrotele.run.run import prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import LogOnGround, Scenario, load_scenario
-from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints, logged_surroundings
+from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.surroundings import POCKET_CENTRE, POCKET_HALF_SIZE, log_grip
+from hydrotele.simulate.surroundings import POCKET_CENTRE, POCKET_HALF_SIZE, timber_log_grip_parameters
 
 END = np.array([6.03 * np.cos(np.pi / 3), 6.03 * np.sin(np.pi / 3)])  # slewed by 60 deg
 
@@ -104,7 +104,7 @@ def test_pick_log_puts_it_down_where_it_should():
     assert run.summary["max_pin_opening_mm"] < 0.05
     machine, truth = run.plant.machine, run.truth
     model = compile_visual_model(machine, surroundings=logged_surroundings(truth))
-    poses = body_poses(machine, model, logged_joints(machine, truth), truth)
+    poses = body_poses(machine, model, extract_joint_motion(machine, truth), truth)
     shown = poses.bodies.index("log_0")
     np.testing.assert_allclose(poses.position[:, shown], place, atol=1e-12)
     grapple = poses.position[:, poses.bodies.index("claw_head")]
@@ -117,7 +117,7 @@ def test_the_pocket_lies_in_the_middle_of_the_jaws():
     """Its room in the claw's frame, less the log's radius where head and jaws are."""
     log = LogOnGround(position=(6.0, 0.0), diameter=0.4)
     plant = build_plant(load_machine("cat215", "grapple_claw"), surroundings=(log,))
-    grip = log_grip(plant.model, log)
+    grip = timber_log_grip_parameters(plant.model, log)
     np.testing.assert_allclose(grip[POCKET_CENTRE : POCKET_CENTRE + 3], [0.7, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(grip[POCKET_HALF_SIZE : POCKET_HALF_SIZE + 3 : 2], [0.14, 0.15], atol=1e-12)
 
@@ -125,12 +125,12 @@ def test_the_pocket_lies_in_the_middle_of_the_jaws():
 def test_a_log_needs_a_grab_with_a_pocket():
     scenario = lowered(grab="clew")
     with pytest.raises(InputError, match="no axis 'clew'; did you mean 'claw'") as error:
-        prepare(scenario)
+        prepare_run(scenario)
     assert error.value.where == "surroundings.0.grab"
     with pytest.raises(InputError, match="needs a box site 'grapple_pocket'"):
-        prepare(lowered(grab="grapple"))
+        prepare_run(lowered(grab="grapple"))
     with pytest.raises(InputError, match="0.9 m does not fit between jaws 0.7 m apart"):
-        prepare(lowered(diameter=0.9))
+        prepare_run(lowered(diameter=0.9))
 
 
 def test_a_log_needs_ground():

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.run.run import prepare, run_scenario, start_session
+from hydrotele.run.run import prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.record import surrounding_bodies, total_contact_force
+from hydrotele.simulate.record import mark_surrounding_bodies, total_contact_force
 
 PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}
 TREE = {"kind": "tree", "position": [8.0, 0.0]}
@@ -41,7 +41,7 @@ def test_a_plate_is_a_spring():
     while session.tick < session.scenario.tick_count:
         session.advance()
     plant, data = session.plant, session.data
-    force = total_contact_force(plant.model, data, surrounding_bodies(plant))
+    force = total_contact_force(plant.model, data, mark_surrounding_bodies(plant))
     depth = -data.joint("plate_0").qpos[0]
     assert force[2] > 5e3
     assert force[2] == pytest.approx(1.0e6 * depth, rel=2e-3)
@@ -77,7 +77,7 @@ def test_a_plate_far_away_changes_nothing():
 
 def test_a_start_in_the_plate_is_refused():
     with pytest.raises(InputError, match="would penetrate the ground or an object by"):
-        prepare(press(position=[6.0, -0.11, 0.6]))
+        prepare_run(press(position=[6.0, -0.11, 0.6]))
 
 
 def fell(duration, buttons, r=7.4, times=(0.0, 5.5), points=None) -> Scenario:
@@ -162,7 +162,7 @@ def test_a_tree_needs_saw_and_grab(key, value):
     data = fell(3.0, []).model_dump(mode="json")
     data["surroundings"][0][key] = value
     with pytest.raises(InputError, match=f"no axis '{value}'.*valid: ") as error:
-        prepare(Scenario.model_validate(data))
+        prepare_run(Scenario.model_validate(data))
     assert error.value.where == f"surroundings.0.{key}"
 
 
@@ -170,12 +170,12 @@ def test_a_tree_is_no_work_for_an_excavator():
     data = press().model_dump(mode="json")
     data["surroundings"] = [TREE]
     with pytest.raises(InputError, match="no axis 'saw'"):
-        prepare(Scenario.model_validate(data))
+        prepare_run(Scenario.model_validate(data))
 
 
 def test_a_tilted_plate_looks_its_way():
     """Its slide joint runs along the normal, and its face stands at the position."""
-    plant = prepare(press(normal="-x", position=[9.0, 0.0, 1.0])).plant
+    plant = prepare_run(press(normal="-x", position=[9.0, 0.0, 1.0])).plant
     data = mujoco.MjData(plant.model)
     mujoco.mj_kinematics(plant.model, data)
     geom = plant.model.geom("plate_0")

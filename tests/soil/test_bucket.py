@@ -17,7 +17,7 @@ from hydrotele.soil.facts import (
     outline_relative_to_edge,
     pack_soil_parameters,
 )
-from hydrotele.soil.step import compute_held_soil
+from hydrotele.soil.step import compute_bucket_capacity
 
 DEGREE = math.pi / 180.0
 SOIL = SOILS["sandy_loam"]
@@ -26,7 +26,7 @@ NUMBERS = pack_soil_parameters(SOIL, CAT215, 3.0, 0.05)
 
 def held(attitude, level=0.0):
     out = np.empty(4)
-    compute_held_soil(NUMBERS, attitude, level, out)
+    compute_bucket_capacity(NUMBERS, attitude, level, out)
     return out
 
 

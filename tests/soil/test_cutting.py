@@ -23,8 +23,8 @@ from hydrotele.soil.step import (
     cohesion_factor,
     compute_cutting_force,
     failure_plane_angle,
-    limit_rake,
-    limit_slope,
+    limit_rake_angle,
+    limit_surface_slope,
     surcharge_factor,
     wedge_weight_factor,
 )
@@ -158,7 +158,7 @@ angles = {
 @given(**angles, share=st.floats(0.02, 0.98))
 def test_plane_has_the_least_weight_factor(rake, slope, phi, delta, share):
     slope, phi, delta = slope * DEGREE, phi * DEGREE, delta * DEGREE
-    rake = limit_rake(rake * DEGREE, slope, phi, delta)
+    rake = limit_rake_angle(rake * DEGREE, slope, phi, delta)
     widest = math.pi - rake - delta - phi
     best = failure_plane_angle(rake, slope, phi, delta)
     assume(6 * DEGREE < best < 84 * DEGREE)  # not at its bounds
@@ -257,9 +257,9 @@ def test_soil_in_the_bucket_and_loose_soil_change_the_force():
 
 
 def test_slope_and_rake_stay_where_the_equation_holds():
-    assert limit_slope(1.0, 0.5) == pytest.approx(0.3)
-    assert limit_rake(2.5, 0.0, 0.5, 0.3) == pytest.approx(0.5 * math.pi)
-    assert limit_rake(0.0, 0.0, 0.5, 0.3) == pytest.approx(15 * DEGREE)
+    assert limit_surface_slope(1.0, 0.5) == pytest.approx(0.3)
+    assert limit_rake_angle(2.5, 0.0, 0.5, 0.3) == pytest.approx(0.5 * math.pi)
+    assert limit_rake_angle(0.0, 0.0, 0.5, 0.3) == pytest.approx(15 * DEGREE)
 
 
 @pytest.mark.parametrize(

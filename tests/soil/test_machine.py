@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.kinematics.task import arm_parameters, task_forward, task_inverse, task_jacobian
+from hydrotele.kinematics.task import arm_parameters, compute_tip_pose, solve_joint_angles, task_jacobian
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.soil.facts import (
@@ -22,7 +22,7 @@ from hydrotele.soil.facts import (
     make_bucket_state,
     make_level_profile,
     pack_soil_parameters,
-    soil_mass,
+    total_soil_mass,
 )
 from hydrotele.soil.step import EdgeMotion, compute_bucket_wrench, step_soil
 
@@ -41,7 +41,7 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
     g = arm_parameters(arm_geometry(plant.machine))
     order = [plant.axes.index(name) for name in AXES]
     q, pose, jacobian = np.zeros(4), np.zeros(5), np.zeros((4, 4))
-    task_inverse(g, np.array([6.3, 0.0, -0.12, -88.0 * DEGREE, 0.0]), 0.0, q)
+    solve_joint_angles(g, np.array([6.3, 0.0, -0.12, -88.0 * DEGREE, 0.0]), 0.0, q)
     joints = [plant.machine.axes[name].joint for name in AXES]
     data = rest_state(plant, dict(zip(joints, q.tolist(), strict=True)))
     data.ctrl[:] = 0.0
@@ -52,10 +52,10 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
         np.zeros(RESULT_SIZE),
     )
     body, wrench, rows = model.body("bucket").id, np.zeros(6), []
-    mass = soil_mass(n, surface, loose, state)
+    mass = total_soil_mass(n, surface, loose, state)
     period = steps * model.opt.timestep
     for k in range(round(seconds / period)):
-        task_forward(g, data.qpos[plant.qpos[order]], pose)
+        compute_tip_pose(g, data.qpos[plant.qpos[order]], pose)
         task_jacobian(g, data.qpos[plant.qpos[order]], jacobian)
         rate = jacobian @ data.qvel[plant.dof[order]]
         motion = EdgeMotion(pose[0], pose[2], rate[0], rate[2], pose[3])
@@ -66,7 +66,7 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
         data.ctrl[plant.axes.index("stick")] = 0.25 if k * period < draw else 0.0
         mujoco.mj_step(model, data, nstep=steps)
         rows.append((pose[0], pose[2], out[FORCE_R], out[FORCE_Z]))
-    assert soil_mass(n, surface, loose, state) == pytest.approx(mass, abs=1e-9)
+    assert total_soil_mass(n, surface, loose, state) == pytest.approx(mass, abs=1e-9)
     return np.array(rows), state, surface
 
 
@@ -93,7 +93,7 @@ def test_wrench_does_the_work_of_its_parts(plant):
     order = [plant.axes.index(name) for name in AXES]
     pose, jacobian = np.zeros(5), np.zeros((4, 4))
     q = data.qpos[plant.qpos[order]]
-    task_forward(g, q, pose)
+    compute_tip_pose(g, q, pose)
     task_jacobian(g, q, jacobian)
     mujoco.mj_forward(model, data)
     body = model.body("bucket").id

@@ -38,7 +38,7 @@ from hydrotele.soil.facts import (
     make_bucket_state,
     make_level_profile,
     pack_soil_parameters,
-    soil_mass,
+    total_soil_mass,
 )
 from hydrotele.soil.step import EdgeMotion, step_soil
 
@@ -74,7 +74,7 @@ class Ground:
         return np.array(outs)
 
     def mass(self):
-        return soil_mass(self.numbers, self.surface, self.loose, self.state)
+        return total_soil_mass(self.numbers, self.surface, self.loose, self.state)
 
 
 CUT = ((6.6, 0.1, -75.0), (6.4, -0.15, -85.0), (4.8, -0.15, -105.0))

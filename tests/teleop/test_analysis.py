@@ -10,8 +10,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
     TeleoperatorAxis,
     analyse_structure,
+    find_gain_margin,
     find_max_delay,
-    gain_margin,
     is_passive,
     load_teleop_case,
     loop_gain,
@@ -23,8 +23,8 @@ from hydrotele.teleop.findings import (
     describe_stability,
     findings_to_dict,
     is_growing,
-    simulate_impulse,
-    simulate_sine,
+    measure_sine_impedance,
+    simulate_impulse_response,
 )
 from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
 from hydrotele.teleop.two_port import (
@@ -60,7 +60,7 @@ def crossings(case, structure):
 def test_gain_margin_is_that_of_the_phase_crossing(structure):
     case = CASE.with_delay(0.01)
     margin = 1.0 / max(size for _, size in crossings(case, structure))
-    assert gain_margin(case, structure) == pytest.approx(margin, rel=REFINED)
+    assert find_gain_margin(case, structure) == pytest.approx(margin, rel=REFINED)
 
 
 def test_largest_delay_is_that_of_the_gain_crossing():
@@ -147,9 +147,9 @@ def test_the_theorem_is_sufficient_and_not_necessary():
         mass, most = rng.uniform(0.1, 5.0), rng.uniform(100.0, 5e3)
         least = rng.uniform(0.02, 1.0) * most
         firm = StiffnessAxis(mass, 2.05 * math.sqrt(mass * most), least, least, most)
-        assert firm.theorem_margin > 0.0 and firm.half_swing_growth < 1e-6  # never crosses the centre again
+        assert firm.stability_theorem_margin > 0.0 and firm.half_swing_growth < 1e-6  # never crosses the centre again
     between = StiffnessAxis(0.85, 60.0, 600.0, 300.0, 4000.0)  # Zhu 1994, Table 6.7
-    assert between.theorem_margin < 0.0 and between.half_swing_growth < 1.0
+    assert between.stability_theorem_margin < 0.0 and between.half_swing_growth < 1.0
     loose = StiffnessAxis(0.85, 2.0, 600.0, 300.0, 4000.0)
     assert loose.half_swing_growth > 1.0
 
@@ -163,7 +163,7 @@ def test_what_holds_a_spring_adds_to_it():
 
 def test_a_kick_without_a_loop_decays_as_its_poles_say():
     """No reflection: the master alone, whose slowest pole ends the motion."""
-    run = simulate_impulse(CASE, "position_force", 0.0, 4.0)
+    run = simulate_impulse_response(CASE, "position_force", 0.0, 4.0)
     assert not is_growing(run)
     mass = CASE.master.mass + CASE.hand.mass
     damping = CASE.master.damping + CASE.hand.damping + CASE.master_control.damping
@@ -189,7 +189,7 @@ def test_different_delays_there_and_back():
     w = 6.0
     expected = transmitted_impedance(uneven.make_port("rate_force"), 1j * w, uneven.task)
     # 3 % are asked for; the delay is rounded to steps
-    assert abs(simulate_sine(uneven, "rate_force", w) / expected - 1.0) < 0.01
+    assert abs(measure_sine_impedance(uneven, "rate_force", w) / expected - 1.0) < 0.01
     for structure in STRUCTURES:
         same = CASE.with_delay(0.04)
         assert analyse_structure(uneven, structure).unstable_poles == analyse_structure(same, structure).unstable_poles
@@ -199,7 +199,7 @@ def test_the_document_of_the_shipped_case_is_complete():
     facts = load_teleop_case()
     found = analyse_structures(
         facts.name, facts.to_axis(), ("rate_force",), np.array([0.0, 0.1]), np.array([0.1, 1.0]),
-        facts.stiffness.to_spring(), confirm=True,
+        facts.stiffness.to_stiffness_axis(), confirm=True,
     )  # fmt: skip
     document = findings_to_dict(found)
     assert document["structures"]["rate_force"]["stable"]
@@ -222,6 +222,6 @@ def test_tasks_with_mass_and_sides_with_springs(structure):
             continue  # nothing settles
         expected = transmitted_impedance(case.make_port(structure), 1j * w, case.task)
         # second order in steps of at most 0.5 ms: (w h)^2 is 2e-5; settled to 1e-3
-        assert abs(simulate_sine(case, structure, w) / expected - 1.0) < 2e-3
-        kick = simulate_impulse(case, structure)
+        assert abs(measure_sine_impedance(case, structure, w) / expected - 1.0) < 2e-3
+        kick = simulate_impulse_response(case, structure)
         assert is_growing(kick) != is_stable(case.make_port(structure), case.hand, case.task)

@@ -6,7 +6,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
-from hydrotele.teleop.flotor import identify_flotor
+from hydrotele.teleop.flotor import identify_flotor_parameters
 from hydrotele.teleop.levitation import (
     make_excitation_path,
     make_levitation_control,
@@ -31,7 +31,7 @@ def test_planted_numbers_are_found(diodes):
     control = make_levitation_control(joystick, GUESS)
     flight = simulate_levitation(joystick, make_excitation_path(joystick, 12.0), control=control, diodes=diodes)
     assert not flight.limited.any() and np.abs(flight.pose[:, :3]).max() < 5e-3
-    found = identify_flotor(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
+    found = identify_flotor_parameters(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
     truth = np.array([0.85, 0.002, -0.001, 0.02, 1.2e-3, 1.2e-3, 1.5e-3, 0.0, 0.0, 0.0])
     assert (np.abs(found.value - truth) < found.interval_half_width).all()
     # asked for: 0.5 %, 0.5 mm and 5 %; what is told is finer by an order of magnitude and more
@@ -46,15 +46,15 @@ def test_motions_that_tell_too_little_are_refused():
     period, coils = control.period, control.coils
     still = simulate_levitation(joystick, np.zeros((500, 6)))
     with pytest.raises(InputError, match="not all ten parameters"):  # only noise
-        identify_flotor(still.place, still.quaternion, still.currents, period, coils)
+        identify_flotor_parameters(still.place, still.quaternion, still.currents, period, coils)
     with pytest.raises(InputError, match="not all ten parameters"):
-        identify_flotor(
+        identify_flotor_parameters(
             np.tile([0.0, 0.0, -0.12], (500, 1)), np.tile([1.0, 0, 0, 0], (500, 1)),
             still.currents, period, coils,
         )  # fmt: skip
     with pytest.raises(InputError, match="at least"):
-        identify_flotor(still.place[:50], still.quaternion[:50], still.currents[:50], period, coils)
+        identify_flotor_parameters(still.place[:50], still.quaternion[:50], still.currents[:50], period, coils)
     spoilt = still.place.copy()
     spoilt[7] = np.nan
     with pytest.raises(InputError, match="must be finite"):
-        identify_flotor(spoilt, still.quaternion, still.currents, period, coils)
+        identify_flotor_parameters(spoilt, still.quaternion, still.currents, period, coils)

@@ -47,7 +47,7 @@ def test_stiffness_feedback_with_150_ms_each_way_holds_the_ground():
         "pilot.channel.delay_forward": "0.15", "pilot.channel.delay_back": "0.15",
         "pilot.operator.target.time": "[0.0]", "pilot.operator.target.force": f"[{TARGET}]",
     }  # fmt: skip
-    assert analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.theorem_margin > 0.0
+    assert analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.stability_theorem_margin > 0.0
     assert swing("press_stiffness", overrides) < 0.25
 
 

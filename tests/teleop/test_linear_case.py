@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.state_filter import butterworth_response, filter_signal, filter_table
+from hydrotele.control.state_filter import butterworth_response, filter_signal, filter_step_matrix
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
@@ -15,7 +15,7 @@ from hydrotele.teleop.findings import analyse_scenario_case, analyse_scenario_lo
 from hydrotele.teleop.linear_case import (
     DEFAULT_TASK,
     build_scenario_case,
-    scenario_joystick,
+    find_scenario_joystick,
     tip_controller_impedance,
     tip_tracking_response,
 )
@@ -28,7 +28,7 @@ def made(name="press_direct", coordinate=None, **overrides):
     pairs = {key.replace("__", "."): value for key, value in overrides.items()}
     scenario = load_scenario(name, pairs)
     machine = load_machine(scenario.machine, scenario.tool)
-    return build_scenario_case(scenario, machine, load_joystick(scenario_joystick(scenario)), coordinate)
+    return build_scenario_case(scenario, machine, load_joystick(find_scenario_joystick(scenario)), coordinate)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_filter_is_what_the_estimator_does():
     """A sine through the sampled filter has the transfer function's size and phase."""
     period, frequency, bandwidth = 0.02, 1.0, 1.5
     time = period * np.arange(2000)
-    out = filter_signal(filter_table(bandwidth, period), np.sin(2.0 * np.pi * frequency * time))[:, 0]
+    out = filter_signal(filter_step_matrix(bandwidth, period), np.sin(2.0 * np.pi * frequency * time))[:, 0]
     late = slice(1000, None)  # 20 whole periods
     wave = np.exp(-2j * np.pi * frequency * time[late])
     seen = 2j * np.mean(out[late] * wave)
@@ -125,10 +125,10 @@ def test_pole_lies_on_the_axis_at_the_limit(case):
 
 def test_theorem_counts_the_hand_and_its_damping():
     scenario_gains = analyse_scenario_case("a", *made("press_stiffness")[:1], "")
-    assert scenario_gains.held_spring.theorem_margin == pytest.approx(68.0**2 - 4.0 * 1.45 * 4250.0)
+    assert scenario_gains.held_spring.stability_theorem_margin == pytest.approx(68.0**2 - 4.0 * 1.45 * 4250.0)
     assert not scenario_gains.loop.is_scenario_structure
     damped = analyse_scenario_case("a", made("press_stiffness", pilot__stiffness="{z: {damping: 150.0}}")[0], "")
-    assert damped.held_spring.theorem_margin > 0.0
+    assert damped.held_spring.stability_theorem_margin > 0.0
     # K_r x: 3400 N/m over 50 kN, 1.5 mm
     assert damped.deadband_edge_ratio == pytest.approx(3400.0 / 5e4 * 1.5e-3)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import load_joystick, principal_values
+from hydrotele.machine.joystick import find_principal_values, load_joystick
 from hydrotele.scenario.teleoperation import OperatorSettings, TeleopPilot
 from hydrotele.teleop.manual_control import (
     DOUBLE_INTEGRATOR,
@@ -16,11 +16,11 @@ from hydrotele.teleop.manual_control import (
     GAIN,
     INTEGRATOR,
     decide_hand_reference,
+    discretise_neuromuscular_lag,
     find_crossover,
     make_sum_of_sines,
     make_visual_loop,
     measure_describing_functions,
-    neuromuscular_matrix,
     operator_response,
     simulate_tracking,
 )
@@ -30,7 +30,7 @@ from hydrotele.teleop.operator_parameters import (
     attach_operator_hand,
     load_operator_file,
     make_operator,
-    scenario_operator,
+    make_scenario_operator,
 )
 
 HIM = make_operator(load_operator_file(), None)
@@ -96,15 +96,15 @@ def test_he_learns_a_gain_that_he_did_not_expect(form):
 
 def test_the_neuromuscular_step_is_exact():
     """A held input for one second, in one step and in a hundred."""
-    one = neuromuscular_matrix(12.0, 0.3, 1.0)
-    many = neuromuscular_matrix(12.0, 0.3, 0.01)
+    one = discretise_neuromuscular_lag(12.0, 0.3, 1.0)
+    many = discretise_neuromuscular_lag(12.0, 0.3, 0.01)
     place, rate = 0.0, 0.0
     for _ in range(100):
         place, rate = (
             many[0] * place + many[1] * rate + many[2], many[3] * place + many[4] * rate + many[5]
         )  # fmt: skip
     assert (place, rate) == pytest.approx((one[2], one[5]), abs=1e-12)
-    assert neuromuscular_matrix(0.0, 0.3, 0.01).tolist() == [0, 0, 1, 0, 0, 0]
+    assert discretise_neuromuscular_lag(0.0, 0.3, 0.01).tolist() == [0, 0, 1, 0, 0, 0]
 
 
 def test_the_same_number_draws_the_same_operator_within_the_spread():
@@ -126,16 +126,16 @@ def test_an_own_file_changes_what_it_names(tmp_path):
         "name: me\nparameters:\n  tremor: {value: 0.2, low: 0.1, high: 0.3, unit: N,"
         " basis: identified, source: a record of mine}\n"
     )
-    him = scenario_operator(OperatorSettings(file="me.yaml", haptic_delay=0.2), str(tmp_path))
+    him = make_scenario_operator(OperatorSettings(file="me.yaml", haptic_delay=0.2), str(tmp_path))
     assert (him.tremor, him.haptic_delay, him.remnant) == (0.2, 0.2, HIM.remnant)
     (tmp_path / "bad.yaml").write_text("name: me\nparameters: {tremors: {value: 1}}\n")
     with pytest.raises(InputError, match="bad.yaml"):
-        scenario_operator(OperatorSettings(file="bad.yaml"), str(tmp_path))
+        make_scenario_operator(OperatorSettings(file="bad.yaml"), str(tmp_path))
     (tmp_path / "old.yaml").write_text(
         "name: me\nparameters:\n  touch: {value: 0.2, low: 0.1, high: 0.3, basis: identified, source: a record}\n"
     )
     with pytest.raises(InputError, match="old.yaml:1: .*unknown key 'touch': it is now called 'haptic_delay'"):
-        scenario_operator(OperatorSettings(file="old.yaml"), str(tmp_path))
+        make_scenario_operator(OperatorSettings(file="old.yaml"), str(tmp_path))
 
 
 @pytest.mark.parametrize("form", range(3))
@@ -161,11 +161,11 @@ def test_posture_makes_ellipses_of_the_hand():
     stick, file = load_joystick(), load_operator_file()
     hands = {p: attach_operator_hand(stick, OperatorSettings(grip="normal", posture=p)).hand
              for p in ("near", "mid", "far")}  # fmt: skip
-    long = [principal_values(h.stiffness_shape) for h in hands.values()]
+    long = [find_principal_values(h.stiffness_shape) for h in hands.values()]
     ratio = [p.max_value / p.min_value for p in long]
     assert ratio[0] < 2.0 < ratio[1] < 3.0 < ratio[2]
     assert abs(long[1].angle) < np.deg2rad(5.0) and abs(long[2].angle) < np.deg2rad(5.0)
-    mid = principal_values(hands["mid"].stiffness_shape)
+    mid = find_principal_values(hands["mid"].stiffness_shape)
     assert mid.min_value * mid.max_value == pytest.approx(1.0)  # its geometric mean is the grip's
     assert hands["mid"].stiffness == file.grips["normal"].stiffness
     assert hands["far"].axis_impedance(0)[2] > 1.4 * hands["mid"].axis_impedance(0)[2] > 1.4 * 250.0

@@ -13,10 +13,10 @@ from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, build_axis_t
 from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.master import (
     build_master,
-    compute_reflection,
+    compute_reflected_forces,
     drive_coils,
     step_master,
-    unpack_master,
+    unpack_master_parameters,
     unpack_master_state,
 )
 from tools.studies.handle_laws import Detent, StiffnessFeedback
@@ -36,7 +36,7 @@ def built(**changed):
 
 
 def pushed(numbers, s, packet=None, fresh=1.0):
-    compute_reflection(numbers, np.zeros((8, 4)) if packet is None else packet, fresh, PERIOD, s)
+    compute_reflected_forces(numbers, np.zeros((8, 4)) if packet is None else packet, fresh, PERIOD, s)
     return s.push
 
 
@@ -162,7 +162,7 @@ def test_flat_arrays_show_the_parts():
     rng = np.random.default_rng(0)
     numbers, s = built()
     for whole, parts, unpack in (
-        (flat_view(numbers), numbers, unpack_master), (flat_view(s), s, unpack_master_state),
+        (flat_view(numbers), numbers, unpack_master_parameters), (flat_view(s), s, unpack_master_state),
     ):  # fmt: skip
         whole[:] = rng.standard_normal(len(whole))
         for shown, part in zip(unpack(whole), parts, strict=True):

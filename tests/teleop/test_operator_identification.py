@@ -19,11 +19,11 @@ from hydrotele.teleop.manual_control import (
     make_sum_of_sines,
     simulate_tracking,
 )
-from hydrotele.teleop.operator_identification import identify_operator, read_tracking
+from hydrotele.teleop.operator_identification import identify_operator, read_tracking_record
 from hydrotele.teleop.operator_parameters import (
     load_operator_file,
     make_operator,
-    scenario_operator,
+    make_scenario_operator,
 )
 
 FILE = load_operator_file()
@@ -101,14 +101,14 @@ def test_command_writes_an_operator_that_a_scenario_takes(tmp_path):
     found = json.loads(done.stdout)
     assert found["controlled_element"] == "K/s"
     assert any("2 missing values of hand" in note for note in found["notes"])
-    him = scenario_operator(OperatorSettings(file="o/operator.yaml"), str(tmp_path))
+    him = make_scenario_operator(OperatorSettings(file="o/operator.yaml"), str(tmp_path))
     assert him.visual_delay == pytest.approx(found["estimates"]["delay"]["value"], abs=1e-4)
     assert CliRunner().invoke(app, [*words[:2], "--equalisation", "gain"]).exit_code == 0
 
 
 def test_a_force_serves_where_there_is_no_hand(tmp_path):
     write(tmp_path / "t.csv", record(2, 60.0), header="time [ms],target,response,force")
-    read, said = read_tracking(tmp_path / "t.csv")
+    read, said = read_tracking_record(tmp_path / "t.csv")
     assert "force" in said[0] and np.ptp(read.hand) > 0.0
 
 
@@ -127,10 +127,10 @@ def test_what_cannot_be_used_is_refused(tmp_path, change, message):
     table = np.column_stack(made)
     np.savetxt(path, table, delimiter=",", header="time,target,response,hand", comments="")
     with pytest.raises(InputError, match=message):
-        identify_operator(read_tracking(path)[0], source=str(path))
+        identify_operator(read_tracking_record(path)[0], source=str(path))
 
 
 def test_a_column_that_is_not_there_is_named(tmp_path):
     write(tmp_path / "t.csv", record(0, 40.0))
     with pytest.raises(InputError, match="name it with --hand"):
-        read_tracking(tmp_path / "t.csv", {"hand": "stick"})
+        read_tracking_record(tmp_path / "t.csv", {"hand": "stick"})

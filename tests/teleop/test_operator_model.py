@@ -51,7 +51,7 @@ def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
         him, _ = person(STEER, views=views, mode=mode, perception=calm)
         wanted.append([])
         for tick in range(0, TICKS, him.ticks_per_decision):
-            him.decide(tick)
+            him.decide_handle_reference(tick)
             wanted[-1].append(him.muscles.reference[2])
     same = np.equal(*wanted)
     first = np.flatnonzero(~same)[0] * him.ticks_per_decision
@@ -64,14 +64,14 @@ def test_his_hand_stays_within_the_way_of_the_handle():
     views.values["measured"][:, 0, 2] = -50.0
     him, numbers = person(STEER, views=views, mode="position", perception={"max_crossover_frequency": 50.0})
     for tick in range(0, TICKS, him.ticks_per_decision):
-        him.decide(tick)
+        him.decide_handle_reference(tick)
         assert abs(him.muscles.reference[2]) <= numbers.axis[2, HANDLE_RANGE]
 
 
 def test_he_follows_a_path():
     him, _ = person(FOLLOW)
     for tick, place in ((0, 0.0), (52, 0.00208), (100, 0.004), (200, 0.002), (300, 0.002)):
-        him.decide(tick)
+        him.decide_handle_reference(tick)
         assert him.muscles.reference[2] == pytest.approx(place)
 
 

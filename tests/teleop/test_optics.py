@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.teleop.compliance import quaternion_to_matrix, rotation_between
+from hydrotele.teleop.compliance import quaternion_to_matrix, relative_quaternion
 from hydrotele.teleop.levitation import (
     diode_readings,
     pose_resolution,
-    quaternion_to_vector,
+    quaternion_to_rotation_vector,
+    rotation_vector_to_quaternion,
     solve_flotor_pose,
-    vector_to_quaternion,
 )
 
 JOYSTICK = load_joystick()
@@ -22,7 +22,7 @@ FAR, STEP = JOYSTICK.diodes.distance, JOYSTICK.diodes.step
 
 def turned(vector):
     out = np.empty((3, 3))
-    quaternion_to_matrix(vector_to_quaternion(np.asarray(vector, float)), out)
+    quaternion_to_matrix(rotation_vector_to_quaternion(np.asarray(vector, float)), out)
     return out
 
 
@@ -77,7 +77,7 @@ def test_beams_that_miss_and_readings_that_fit_no_pose():
 
 
 def test_rotation_between_takes_the_shorter_way():
-    first = vector_to_quaternion(np.array([0.0, 0.1, 0.0]))
-    scalar, vector = rotation_between(first, -vector_to_quaternion(np.array([0.0, 0.3, 0.0])))
-    back = quaternion_to_vector(np.array([scalar, *vector]))
+    first = rotation_vector_to_quaternion(np.array([0.0, 0.1, 0.0]))
+    scalar, vector = relative_quaternion(first, -rotation_vector_to_quaternion(np.array([0.0, 0.3, 0.0])))
+    back = quaternion_to_rotation_vector(np.array([scalar, *vector]))
     np.testing.assert_allclose(back, [0.0, 0.2, 0.0], atol=1e-12)

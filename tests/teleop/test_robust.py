@@ -7,16 +7,16 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import TeleoperatorAxis, analyse_structure, load_teleop_case
-from hydrotele.teleop.findings import is_growing, simulate_impulse
+from hydrotele.teleop.findings import is_growing, simulate_impulse_response
 from hydrotele.teleop.robust import (
     ImpedanceRanges,
     case_impedance_ranges,
+    compute_llewellyn_parameter,
+    compute_master_polynomial,
     compute_z_width,
+    evaluate_random_hands_and_tasks,
     evaluate_robustness,
-    evaluate_sampled_pairs,
     is_absolutely_stable,
-    llewellyn,
-    master_polynomial,
     port_with_task,
 )
 from hydrotele.teleop.sampled import PASSIVITY_STRUCTURE, constant_delay_ages
@@ -61,7 +61,7 @@ def test_the_parameter_tells_less_than_passivity_asks():
     heavy = replace(EQUAL, master=Impedance(0.8, 400.0), gains=StructureGains(force=0.5),
                     slave=Impedance(2.0, 400.0))  # fmt: skip
     port = heavy.make_port("position_force")
-    assert llewellyn(port, 1j * np.geomspace(1.0, 100.0, 50)).min() > 1.0
+    assert compute_llewellyn_parameter(port, 1j * np.geomspace(1.0, 100.0, 50)).min() > 1.0
 
 
 def test_z_width():
@@ -82,13 +82,13 @@ def test_z_width():
 
 def test_the_released_handle_of_rate_position():
     """Zhu 1994, 3.71-3.72: without damping of the master's own it cannot be stable."""
-    found = master_polynomial(CASE, "rate_position")
+    found = compute_master_polynomial(CASE, "rate_position")
     assert found.unstable_zeros == 2 and found.coefficients[1] == 0.0
-    assert master_polynomial(CASE, "rate_position", CASE.hand).unstable_zeros == 0
+    assert compute_master_polynomial(CASE, "rate_position", CASE.hand).unstable_zeros == 0
     one = analyse_structure(CASE, "rate_position")
     assert one.is_stable_held and not one.is_stable_released and one.unstable_poles_released == 2
-    assert not is_growing(simulate_impulse(CASE, "rate_position"))
-    assert is_growing(simulate_impulse(replace(CASE, hand=ONE), "rate_position"))
+    assert not is_growing(simulate_impulse_response(CASE, "rate_position"))
+    assert is_growing(simulate_impulse_response(replace(CASE, hand=ONE), "rate_position"))
 
 
 def test_the_damping_that_lets_a_released_handle_rest():
@@ -97,14 +97,14 @@ def test_the_damping_that_lets_a_released_handle_rest():
     edge = CASE.master.mass * control.stiffness / control.damping
     for factor, many in ((0.99, 2), (1.01, 0)):
         own = Impedance(CASE.master.mass, factor * edge)
-        assert master_polynomial(replace(CASE, master=own), "rate_position").unstable_zeros == many
+        assert compute_master_polynomial(replace(CASE, master=own), "rate_position").unstable_zeros == many
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_letting_go_is_seen_in_simulation(structure):
     case = replace(CASE, hand=ONE, gains=StructureGains(1.0, 0.5, 0.05))
     found = analyse_structure(replace(case, hand=CASE.hand), structure)
-    assert is_growing(simulate_impulse(case, structure)) == (found.unstable_poles_released != 0)
+    assert is_growing(simulate_impulse_response(case, structure)) == (found.unstable_poles_released != 0)
 
 
 def test_the_theorem_needs_a_least_stiffness():
@@ -120,7 +120,7 @@ def test_the_theorem_needs_a_least_stiffness():
 ])  # fmt: skip
 def test_the_published_gains_are_stable_by_the_switching_bound(spring, margin):
     held = spring.with_hand(CASE.hand)
-    assert held.theorem_margin == pytest.approx(margin)
+    assert held.stability_theorem_margin == pytest.approx(margin)
     assert held.stability_criterion == "switching bound" and held.half_swing_growth < 1.0
     edge = replace(held, damping=held.min_stable_damping)
     assert edge.half_swing_growth == pytest.approx(1.0, abs=0.01) and edge.damping < held.damping
@@ -130,11 +130,11 @@ def test_the_published_gains_are_stable_by_the_switching_bound(spring, margin):
 def test_worst_of_drawn_hands_and_tasks():
     line = constant_delay_ages(0.005, 0.1, 0.1)
     spread = case_impedance_ranges(FACTS)
-    found = evaluate_sampled_pairs(CASE, "rate_force", line, spread, 10)
+    found = evaluate_random_hands_and_tasks(CASE, "rate_force", line, spread, 10)
     worst = replace(CASE, hand=found.worst_hand, task=found.worst_task)
     assert 0 < found.unstable_count < 10  # 123 ms is the limit of the one operator of the case
     assert found.worst_growth_rate > 0.0
-    again = evaluate_sampled_pairs(
+    again = evaluate_random_hands_and_tasks(
         worst,
         "rate_force",
         line,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from hydrotele.control.resolved_motion import arm_specification
-from hydrotele.control.servo import DriveReference, tabulate_drives
+from hydrotele.control.servo import DriveReference, tabulate_drive_geometry
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.axis_table import flat_view, flatten_state
+from hydrotele.teleop.axis_table import copy_to_contiguous_state, flat_view
 from hydrotele.teleop.master import build_master
 from hydrotele.teleop.operator_model import NeuromuscularState
 from hydrotele.teleop.round_trip import (
@@ -37,7 +37,7 @@ class RoundTrip:
         )
         self.m, self.ms = build_master(STICK, pilot, ("r", "theta", "z", "attitude"))
         self.s, self.ss = build_slave(CAT, pilot, self.m, HOME[COLUMNS])
-        self.hand = flatten_state(NeuromuscularState(*(np.zeros(6) for _ in range(2)), np.full((3, 6), -1.0),
+        self.hand = copy_to_contiguous_state(NeuromuscularState(*(np.zeros(6) for _ in range(2)), np.full((3, 6), -1.0),
                                       *(np.zeros(6) for _ in range(3)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(2)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(3))))  # fmt: skip
@@ -48,7 +48,7 @@ class RoundTrip:
         self.state = np.array([0.0, 1.0, PERIOD, pilot.safety.packet_timeout, FADE])
         self.qpos, self.force = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.zeros(4)
         self.joint = HOME.copy()
-        self.grid, self.table = tabulate_drives(CAT, AXES)
+        self.grid, self.table = tabulate_drive_geometry(CAT, AXES)
         self.tick = 0
 
     def step(self, tripped=False):

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import gain_margin, load_teleop_case
-from hydrotele.teleop.round_trip import compute_arriving_ages, compute_packet_ages, load_delays
+from hydrotele.teleop.analysis import find_gain_margin, load_teleop_case
+from hydrotele.teleop.round_trip import compute_arriving_ages, compute_packet_ages, load_packet_delays
 from hydrotele.teleop.sampled import (
     PASSIVITY_STRUCTURE,
     SAMPLED_STRUCTURES,
     WAVE_STRUCTURE,
     PacketAges,
+    compute_max_growth_rate,
     constant_delay_ages,
-    growth_rate,
     jitter_gain,
     measured_delay_ages,
     predict_stability,
 )
-from hydrotele.teleop.sampled_run import simulate_kick
+from hydrotele.teleop.sampled_run import simulate_initial_velocities
 from hydrotele.teleop.two_port import STRUCTURES, Impedance
 from tools.studies import stability_study
 
@@ -40,7 +40,7 @@ def test_fine_sampling_gives_the_margin_of_the_continuous_loop(structure):
     """2 %: half a period of hold and half one of differences, of delays of 20 ms each way."""
     period = 2e-4
     line = constant_delay_ages(period, CASE.delay_forward, CASE.delay_back)
-    margin = gain_margin(CASE, structure)
+    margin = find_gain_margin(CASE, structure)
     told = [predict_stability(CASE, structure, line, k * margin).is_stable for k in (0.98, 1.02)]
     assert told == [True, False]
 
@@ -90,7 +90,7 @@ def test_growth_is_that_of_a_periods_matrix(forward, back, force):
     line = constant_delay_ages(PERIOD, forward * PERIOD, back * PERIOD)
     exact = spectral_rate(case, PERIOD, forward, back)
     # the rate is bisected to 1e-3 of it
-    assert growth_rate(case, "position_force", line) == pytest.approx(exact, rel=3e-3, abs=3e-3)
+    assert compute_max_growth_rate(case, "position_force", line) == pytest.approx(exact, rel=3e-3, abs=3e-3)
 
 
 @pytest.mark.nightly
@@ -123,7 +123,7 @@ def test_a_line_of_waves_gives_no_energy_whatever_its_jitter(seed):
     case = replace(CASE, hand=Impedance()) if seed == 0 else CASE
     period = 0.001 if seed == 0 else PERIOD
     delays = [jitter((seed, way), 0.1, round(20.0 / period)) for way in range(2)]
-    run = simulate_kick(case, WAVE_STRUCTURE, period, *delays)
+    run = simulate_initial_velocities(case, WAVE_STRUCTURE, period, *delays)
     assert not run.is_growing and run.has_decayed
     assert run.line_energy.min() > -1e-12
 
@@ -134,8 +134,8 @@ def test_passivity_control_holds_a_line_that_is_unstable_without(hand):
     case = replace(CASE, hand=CASE.hand if hand else Impedance())
     delays = [jitter((7, way), 0.1, 6000) for way in range(2)]
     line = measured_delay_ages(PERIOD, *delays)
-    assert growth_rate(case, PASSIVITY_STRUCTURE, line) > 1.0
-    run = simulate_kick(case, PASSIVITY_STRUCTURE, PERIOD, *delays)
+    assert compute_max_growth_rate(case, PASSIVITY_STRUCTURE, line) > 1.0
+    run = simulate_initial_velocities(case, PASSIVITY_STRUCTURE, PERIOD, *delays)
     assert not run.is_growing
     assert run.line_energy.min() > -3.1e-4  # and what a hand adds within a period, of 11 mJ
 
@@ -168,7 +168,7 @@ def test_shares_of_ages():
 def test_measured_delays(tmp_path):
     path = tmp_path / "delays.csv"
     path.write_text("forward,back\n0.01,0.02\n,0.03\n", "utf-8")
-    forward, back = load_delays(path)
+    forward, back = load_packet_delays(path)
     assert forward[0] == 0.01 and np.isnan(forward[1]) and back.tolist() == [0.02, 0.03]
     for text, message in (
         ("forward\n0.1\n", "no column 'back'"),
@@ -178,9 +178,9 @@ def test_measured_delays(tmp_path):
     ):
         path.write_text(text, "utf-8")
         with pytest.raises(InputError, match=message):
-            load_delays(path)
+            load_packet_delays(path)
     with pytest.raises(InputError, match="cannot be read"):
-        load_delays(tmp_path / "none.csv")
+        load_packet_delays(tmp_path / "none.csv")
 
 
 def test_unknown_structures():

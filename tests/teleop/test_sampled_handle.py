@@ -13,9 +13,9 @@ from hydrotele.teleop.sampled import (
     HandleBody,
     make_spinning_body,
     make_tilting_body,
-    max_loop_eigenvalue,
-    max_stable_damping,
-    min_stable_inertia,
+    max_sampled_handle_eigenvalue,
+    max_stable_handle_damping,
+    min_stable_handle_inertia,
 )
 
 JOYSTICK = load_joystick()
@@ -26,24 +26,24 @@ PERIOD = 1.0 / JOYSTICK.control_rate
 @pytest.mark.parametrize("period", [1e-3, 5e-3])
 def test_without_a_spring_the_limit_is_twice_the_inertia_by_the_period(inertia, period):
     """V' = v - a (v + v_before), a = B T / 2 J: z^2 - (1 - a) z + a = 0, stable for a < 1."""
-    assert max_stable_damping(inertia, 0.0, period) == pytest.approx(2.0 * inertia / period, rel=1e-6)
-    assert min_stable_inertia(3.0, 0.0, period) == pytest.approx(1.5 * period, rel=1e-6)
+    assert max_stable_handle_damping(inertia, 0.0, period) == pytest.approx(2.0 * inertia / period, rel=1e-6)
+    assert min_stable_handle_inertia(3.0, 0.0, period) == pytest.approx(1.5 * period, rel=1e-6)
 
 
 def test_limits_and_inertias_are_inverse_to_each_other():
-    inertia = min_stable_inertia(3.0, 6.0, PERIOD)
-    assert max_stable_damping(inertia * 1.001, 6.0, PERIOD) == pytest.approx(3.0, rel=0.01)
+    inertia = min_stable_handle_inertia(3.0, 6.0, PERIOD)
+    assert max_stable_handle_damping(inertia * 1.001, 6.0, PERIOD) == pytest.approx(3.0, rel=0.01)
 
 
 def test_fine_sampling_is_a_spring_and_damper():
-    decay = max_loop_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([0.05]), 1e-5)
+    decay = max_sampled_handle_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([0.05]), 1e-5)
     # poles of J s^2 + B s + K have the real part -B / 2 J
     assert np.log(decay) / 1e-5 == pytest.approx(-0.05 / 3e-3, rel=2e-3)
 
 
 def test_a_body_without_mass_is_refused():
     with pytest.raises(InputError, match="mass must be positive"):
-        max_loop_eigenvalue(HandleBody(*np.zeros((3, 1, 1))), np.ones(1), np.ones(1), PERIOD)
+        max_sampled_handle_eigenvalue(HandleBody(*np.zeros((3, 1, 1))), np.ones(1), np.ones(1), PERIOD)
 
 
 def test_the_published_rotational_damping_shakes_every_flotor_of_this_size():
@@ -54,10 +54,10 @@ def test_the_published_rotational_damping_shakes_every_flotor_of_this_size():
     for stiff, turn, damping in ((600.0, 6.0, 3.0), (4000.0, 45.0, 4.0)):
         springs, dampers = np.array([stiff, turn]), np.array([60.0, damping])
         body = make_tilting_body(f.mass, arm, f.inertia[0], hand)
-        assert max_loop_eigenvalue(body, springs, dampers, PERIOD) > 1.2
-        assert max_loop_eigenvalue(body, springs, dampers, 1e-3) < 1.0  # 1 kHz would hold it
+        assert max_sampled_handle_eigenvalue(body, springs, dampers, PERIOD) > 1.2
+        assert max_sampled_handle_eigenvalue(body, springs, dampers, 1e-3) < 1.0  # 1 kHz would hold it
         # as gyration of 0.85 kg: beyond 90 mm, nearly twice the radius of the coils
-        assert np.sqrt(min_stable_inertia(damping, turn, PERIOD) / f.mass) > 0.09
+        assert np.sqrt(min_stable_handle_inertia(damping, turn, PERIOD) / f.mass) > 0.09
 
 
 def growth(axis: int, stiffness: float, damping: float, joystick) -> float:
@@ -83,7 +83,9 @@ def test_mujoco_grows_or_decays_as_the_eigenvalues_say(damping):
     """Turning about the handle's own axis, rz, where nothing else is coupled."""
     stiffness, axis = 6.0, AXES.index("rz")
     inertia = JOYSTICK.flotor.inertia[2]
-    expected = max_loop_eigenvalue(make_spinning_body(inertia), np.array([stiffness]), np.array([damping]), PERIOD)
+    expected = max_sampled_handle_eigenvalue(
+        make_spinning_body(inertia), np.array([stiffness]), np.array([damping]), PERIOD
+    )
     found = growth(axis, stiffness, damping, JOYSTICK)
     assert (found < 1.0) == (expected < 1.0)
     # rates read off 20 ms maxima of an oscillation

@@ -17,7 +17,7 @@ from hydrotele.teleop.slave import (
     build_slave,
     measure_tip,
     step_slave,
-    unpack_slave,
+    unpack_slave_parameters,
     unpack_slave_state,
 )
 
@@ -176,7 +176,7 @@ def test_a_reading_that_is_none_leaves_the_measured_pose():
 
 def test_flat_arrays_show_the_parts():
     side, rng = Side(), np.random.default_rng(0)
-    for parts, unpack in ((side.numbers, unpack_slave), (side.s, unpack_slave_state)):
+    for parts, unpack in ((side.numbers, unpack_slave_parameters), (side.s, unpack_slave_state)):
         whole = flat_view(parts)
         whole[:] = rng.standard_normal(len(whole))
         for shown, part in zip(unpack(whole, 4), parts, strict=True):

@@ -21,7 +21,7 @@ from hydrotele.teleop.axis_table import (
     GAIN,
     MAX_REFLECTED_FORCE,
 )
-from hydrotele.teleop.levitation import quaternion_to_vector
+from hydrotele.teleop.levitation import quaternion_to_rotation_vector
 from hydrotele.teleop.master import build_master
 
 PERIOD = 0.005
@@ -276,7 +276,7 @@ def worked(duration, **pilot):
         place = data.qpos[:3].copy()
         session.advance()
         speed = (data.qpos[:3] - place) / PERIOD
-        turn, turned = quaternion_to_vector(data.qpos[3:7]), turn
+        turn, turned = quaternion_to_rotation_vector(data.qpos[3:7]), turn
         spin = (turn - turned) / PERIOD
         force = session.station.operator.muscles.force[:3].copy()
         force[2] -= 9.81 * hand.mass

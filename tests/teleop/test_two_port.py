@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import TeleoperatorAxis
-from hydrotele.teleop.findings import compare_stability, is_growing, simulate_impulse, simulate_sine
+from hydrotele.teleop.findings import compare_stability, is_growing, measure_sine_impedance, simulate_impulse_response
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Impedance,
@@ -19,7 +19,7 @@ from hydrotele.teleop.two_port import (
     is_stable,
     make_two_port,
     scattering_norm,
-    stiffness_margin,
+    stability_theorem_margin,
     transmitted_impedance,
 )
 
@@ -108,7 +108,7 @@ def test_what_is_felt_in_a_sine_sweep(structure, turns):
             assert structure == "four_channel_position" and delay  # nothing settles then
             continue
         expected = transmitted_impedance(case.make_port(structure), 1j * w, TASK)
-        assert abs(simulate_sine(case, structure, w) - expected) < 0.03 * abs(expected)
+        assert abs(measure_sine_impedance(case, structure, w) - expected) < 0.03 * abs(expected)
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
@@ -137,7 +137,9 @@ def test_predicted_stability_over_the_gains_themselves(structure, gains):
     for gain, delay in itertools.product(gains, (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)):
         own = StructureGains(velocity=gain) if "rate" in structure else StructureGains(force=gain)
         case = TeleoperatorAxis(MASTER, SLAVE, CM, CS, HAND, TASK, own, delay, delay)
-        agree.append(is_stable(case.make_port(structure), HAND, TASK) != is_growing(simulate_impulse(case, structure)))
+        agree.append(
+            is_stable(case.make_port(structure), HAND, TASK) != is_growing(simulate_impulse_response(case, structure))
+        )
     assert np.mean(agree) >= 0.95
 
 
@@ -154,8 +156,8 @@ def test_the_theorem_of_stiffness_feedback_holds_where_stiffness_jumps():
             sizes.append(abs(x))
         return max(sizes[-5000:]) / max(sizes[:5000])
 
-    assert stiffness_margin(mass, 41.0, stiffest) > 0.0 and worst(41.0) < 1e-3
-    assert stiffness_margin(mass, 2.0, stiffest) < 0.0 and worst(2.0) > 10.0
+    assert stability_theorem_margin(mass, 41.0, stiffest) > 0.0 and worst(41.0) < 1e-3
+    assert stability_theorem_margin(mass, 2.0, stiffest) < 0.0 and worst(2.0) > 10.0
 
 
 def test_nonsense_is_refused():

@@ -18,7 +18,7 @@ from hydrotele.terms.law import (
     DriveState,
     Play,
     Term,
-    formula_arguments,
+    encode_formula,
     law,
 )
 from hydrotele.terms.table import (
@@ -29,11 +29,11 @@ from hydrotele.terms.table import (
     FLOW_SUPPLY,
     FORCE,
     NO_TERMS,
+    encode_terms_table,
     has_term,
     sum_flow_terms,
     sum_terms,
     sum_terms_with_slope,
-    terms_table,
     update_term_state,
 )
 
@@ -93,7 +93,7 @@ def test_every_law_of_the_package_is_tried_here():
 
 @pytest.mark.parametrize("name", USED)
 def test_compiled_laws_are_those_by_hand(name):
-    table = terms_table([force_term(name, USED[name])], ["a"])
+    table = encode_terms_table([force_term(name, USED[name])], ["a"])
     # smoothing of the orifice over its pressure drop squared: 1e-4 / 4
     assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(by_hand(name, USED[name]), rel=3e-5)
     assert sum_terms(table, FORCE, 1, STATE, NO_DRIVES) == 0.0, "another axis"
@@ -115,7 +115,7 @@ def test_basic_functions_of_formulas(text):
         "sin": lambda e, n: sin(2 * math.pi * e / n), "cos": lambda e, n: cos(2 * math.pi * e / n),
         "abs": abs,
     }  # fmt: skip
-    table = terms_table([force_term("formula", {text: -2.5})], ["a"])
+    table = encode_terms_table([force_term("formula", {text: -2.5})], ["a"])
     expected = -2.5 * eval(text, functions, s)
     assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(expected, rel=1e-12)
     assert expected != 0.0
@@ -126,7 +126,7 @@ def test_terms_add_up_and_know_their_slopes():
         force_term("quadratic_drag", {"coefficient": 40.0}),
         force_term("constant", USED["constant"]),
     ]
-    value, slope = sum_terms_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE, NO_DRIVES)
+    value, slope = sum_terms_with_slope(encode_terms_table(terms, ["a"]), FORCE, 0, STATE, NO_DRIVES)
     assert value == pytest.approx(12.0 + 40.0 * 0.21**2)
     assert slope == pytest.approx(-80.0 * 0.21, rel=1e-4)  # a forward difference of 1e-6
     leak = [
@@ -134,7 +134,7 @@ def test_terms_add_up_and_know_their_slopes():
              parameters={"flow_gain": k, "smoothing": 1e3})
         for b, k in (("flow_rod", 1e-8), ("flow_head", -1e-8))
     ]  # fmt: skip
-    head, rod, by_head, by_rod = sum_flow_terms(terms_table(leak, ["a"]), 0, STATE, NO_DRIVES)
+    head, rod, by_head, by_rod = sum_flow_terms(encode_terms_table(leak, ["a"]), 0, STATE, NO_DRIVES)
     assert -head == rod == pytest.approx(1e-8 * math.sqrt(5e6))
     exact = -0.5e-8 / math.sqrt(5e6)
     assert [by_head, by_rod] == pytest.approx([exact, exact], rel=1e-4)  # differences of 100 Pa
@@ -145,7 +145,7 @@ def test_balances_and_drives_that_terms_act_on():
         Term(name="t", axis=axis, balance=balance, law="constant", parameters={"value": 1.0})
         for axis, balance in (("a", "force"), ("b", "flow_rod"), ("b", "force"))
     ]
-    table = terms_table(terms, ["a", "b", "c"])
+    table = encode_terms_table(terms, ["a", "b", "c"])
     told = {
         (balance, drive)
         for balance in (FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY)
@@ -165,13 +165,13 @@ def test_balances_and_drives_that_terms_act_on():
 def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
     law_ = ("formula", {"velocity": 1.0, "position": 10.0})
     bounded = force_term(*law_, domain={"velocity": (-0.1, 0.1), "position": (0.0, 1.0)})
-    table = terms_table([bounded], ["a"])
+    table = encode_terms_table([bounded], ["a"])
     assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.1 + 4.3)
     assert sum_terms(table, FORCE, 0, STATE._replace(velocity=0.05), NO_DRIVES) == pytest.approx(0.05 + 4.3)
 
 
 def test_with_a_window_a_term_acts_for_a_while():
-    table = terms_table([force_term("constant", {"value": 4.0}, window=(2.0, 3.0))], ["a"])
+    table = encode_terms_table([force_term("constant", {"value": 4.0}, window=(2.0, 3.0))], ["a"])
     at = {t: sum_terms(table, FORCE, 0, STATE._replace(time=t), NO_DRIVES)
           for t in (1.9, 1.975, 2.0, 2.5, 3.0, 3.1)}  # fmt: skip
     assert list(at.values()) == pytest.approx([0.0, 1.0, 2.0, 4.0, 2.0, 0.0])
@@ -183,13 +183,13 @@ def test_a_law_may_see_variables_of_another_drive():
     law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
     term = force_term(*law_, variables_from={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
     drives = Drives(2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2))
-    table = terms_table([term], ["a", "b"])
+    table = encode_terms_table([term], ["a", "b"])
     assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
     faster = drives._replace(velocity=np.array([0.0, 3.0]))
     assert sum_terms(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
     assert sum_terms_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
     lone = force_term(*law_, variables_from={"velocity": "b"})
-    assert sum_terms(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
+    assert sum_terms(encode_terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
     with pytest.raises(ValidationError, match="variables_from: 'time'"):
         force_term(*law_, variables_from={"time": "b"})
 
@@ -198,7 +198,7 @@ def test_a_law_may_see_the_force_of_another_drive():
     term = force_term("formula", {"force": 2.0}, variables_from={"force": "b"})
     act = np.array([0.0, 0.0, 9e6, 9e6, 0.0, 0.0, 3e6, 1e6])
     drives = Drives(2, act, np.zeros(2), np.zeros(2), np.zeros(2))
-    table = terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
+    table = encode_terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
     assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(2.0 * (30e3 - 6e3))
     none = drives._replace(count=1)
     assert sum_terms(table, FORCE, 0, STATE, none) == 0.0, "b has no chambers"
@@ -206,7 +206,7 @@ def test_a_law_may_see_the_force_of_another_drive():
 
 def carried(term, values):
     """What a term of axis a remembers along values of its variable."""
-    table, held, told = terms_table([term], ["a"], 4), 0.0, []
+    table, held, told = encode_terms_table([term], ["a"], 4), 0.0, []
     for value in values:
         held = update_term_state(table, 0, value, held)
         told.append(held)
@@ -269,7 +269,7 @@ def test_memories_that_cannot_be_are_refused():
 
 def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
     """As in a file that another process has exported."""
-    table = terms_table([force_term("constant", {"value": 12.0})], ["a"])
+    table = encode_terms_table([force_term("constant", {"value": 12.0})], ["a"])
     law_at, checksum_at = 4, 5
     assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == 12.0
     for place in (-1.0, 500.0, 1023.0, 1024.0, 1e9, -1e9):
@@ -364,12 +364,12 @@ def test_a_taken_name_or_an_unknown_kind_of_argument_is_refused():
 
 
 def test_a_power_may_be_written_as_a_decimal_number():
-    assert formula_arguments({"velocity ** 2.0": 1.0}) == formula_arguments({"velocity ** 2": 1.0})
-    assert formula_arguments({"bump(position, -0.5, 1)": 1.0})["numbers"][-3:] == [-0.5, 1.0, 1]
+    assert encode_formula({"velocity ** 2.0": 1.0}) == encode_formula({"velocity ** 2": 1.0})
+    assert encode_formula({"bump(position, -0.5, 1)": 1.0})["numbers"][-3:] == [-0.5, 1.0, 1]
 
 
 def test_formulas_have_as_many_numbers_as_they_say():
-    numbers = formula_arguments({"1": 1.0, "velocity * sin(position - velocity, 2)": 2.0})
+    numbers = encode_formula({"1": 1.0, "velocity * sin(position - velocity, 2)": 2.0})
     assert numbers["numbers"] == [
         2, 1.0, 0, 2.0, 2,
         0, VARIABLES["velocity"], -1, 0.0, 0.0, 1,

@@ -3,7 +3,7 @@
 python tools/release/environments_page.py --out docs/environments.md
 """
 
-from hydrotele.envs.core import make_setup
+from hydrotele.envs.core import make_task_setup
 from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import TASKS
@@ -62,7 +62,7 @@ def _options() -> str:
 
 
 def _section(task: Task) -> str:
-    setup = make_setup(task, Options(variants=1))
+    setup = make_task_setup(task, Options(variants=1))
     lines = [
         f"## {task.name}",
         "",

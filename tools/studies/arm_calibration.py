@@ -15,8 +15,8 @@ import time
 
 import numpy as np
 
-from hydrotele.calibrate.arm import identify_arm, identify_jointly, machine_with_loop
-from hydrotele.calibrate.arm_poses import add_drift
+from hydrotele.calibrate.arm import identify_arm, identify_jointly, update_machine_geometry
+from hydrotele.calibrate.arm_poses import add_held_link_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.loop import build_loop, unit_of
@@ -113,7 +113,7 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
             true = perturb_loop(nominal, rng)
             clean = [generate_sweep_poses(true, n, s._replace(poses=poses), trial)
                      for n, s in sweeps.items()]  # fmt: skip
-            stages = [add_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
+            stages = [add_held_link_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
             alarms[word] += bool(identify_without_bad_data(nominal, stages).regions)
     places = joints = possible = 0
     before, after = [], []
@@ -122,7 +122,7 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
         rng = np.random.default_rng([2, trial])
         true = perturb_loop(nominal, rng)
         clean = [generate_sweep_poses(true, n, s._replace(poses=poses), trial) for n, s in DRIFT_FREE_SWEEPS.items()]
-        stages = [add_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
+        stages = [add_held_link_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
         which, joint = int(rng.integers(len(stages))), int(rng.integers(4))
         theta, region = corrupted(stages[which].theta, rng, joint)
         stages[which] = dataclasses.replace(stages[which], theta=theta)
@@ -188,7 +188,7 @@ def tip(machines: int) -> str:
         true = perturb_loop(loop, rng, sensor_offset=0.5)
         clean = [generate_sweep_poses(true, link, sweep) for link, sweep in DRIFT_FREE_SWEEPS.items()]
         stages = [simulate_readings(true, one, rng) for one in clean]
-        pairs.append(compute_tip_errors(nominal, machine_with_loop(nominal, loop, true), true, stages))
+        pairs.append(compute_tip_errors(nominal, update_machine_geometry(nominal, loop, true), true, stages))
         rows.append(f"| {seed} | {1e3 * pairs[-1][0]:.1f} | {1e3 * pairs[-1][1]:.1f} |")
     one, two = np.sqrt(np.mean(np.square(pairs), axis=0))
     rows += ["", f"RMS of all machines: {1e3 * one:.1f} mm nominal, {1e3 * two:.1f} mm calibrated,"

@@ -22,10 +22,10 @@ from hydrotele.control.endpoint_force import (
     fit_gravity_to_masses,
     identify_gravity,
 )
-from hydrotele.control.state_filter import VALUE, filter_delay, filter_signal, filter_table
-from hydrotele.machine.machine import Machine, get_sensors
+from hydrotele.control.state_filter import VALUE, filter_delay, filter_signal, filter_step_matrix
+from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import Run, prepare, run_scenario
+from hydrotele.run.run import Run, prepare_run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.record import start_leapfrog
 from tools.studies.study import options, publish, side_by_side
@@ -104,7 +104,7 @@ def false_force(
     for kind in KINDS:
         found = endpoint_force_of_log(
             machine(), run.measured, kind, gravity, bandwidth=bands[0], motion_bandwidth=bands[1],
-            sensors=get_sensors(machine(), sensors),
+            sensors=get_sensor_set(machine(), sensors),
         )  # fmt: skip
         out.append(rms(at_the_tip(run, found)[settled]))
     return out
@@ -119,7 +119,7 @@ def other_ways(run: Run) -> list[float]:
         filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ),
         run.measured.time >= SETTLED,
     )
-    sensors, out = get_sensors(machine(), REAL), []
+    sensors, out = get_sensor_set(machine(), REAL), []
     one = filter_delay(1.0) / (late - filter_delay(OPEN))
     lag = 1.0 - math.exp(-(run.measured.rate**-1) / (late - filter_delay(MOTION_BANDWIDTH_HZ)))
     for fast in (one, MOTION_BANDWIDTH_HZ):
@@ -143,7 +143,7 @@ def true_contact(scenario: Scenario, run: Run) -> np.ndarray:
 
     The run is repeated step by step: a bucket chatters over ground quicker than a log shows.
     """
-    prepared = prepare(scenario)
+    prepared = prepare_run(scenario)
     model, data = prepared.plant.model, prepared.data
     start_leapfrog(model, data)
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
@@ -169,7 +169,7 @@ def true_contact(scenario: Scenario, run: Run) -> np.ndarray:
 def through_filters(signal: np.ndarray, period: float) -> np.ndarray:
     """Apply the filters of the estimate to a signal (n, 3)."""
     for band in (MOTION_BANDWIDTH_HZ, FORCE_BANDWIDTH_HZ):
-        table = filter_table(band, period)
+        table = filter_step_matrix(band, period)
         signal = np.column_stack([filter_signal(table, c.copy())[:, VALUE] for c in signal.T])
     return signal
 
@@ -205,7 +205,9 @@ def contact_errors(gravity: GravityModel, sensors: str, seed: int) -> dict[str, 
     late = through_filters(true, 1.0 / scenario.log_rate)
     errors = []
     for kind in KINDS:
-        found = endpoint_force_of_log(machine(), run.measured, kind, gravity, sensors=get_sensors(machine(), sensors))
+        found = endpoint_force_of_log(
+            machine(), run.measured, kind, gravity, sensors=get_sensor_set(machine(), sensors)
+        )
         errors += [at_the_tip(run, found, true), at_the_tip(run, found, late)]
     for name, (begin, end) in WINDOWS.items():
         rows = (run.truth.time >= begin) & (run.truth.time < end)

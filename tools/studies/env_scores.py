@@ -14,7 +14,7 @@ from hydrotele.envs.controllers.catalogue import (
 )
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate
+from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate_controller
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import REAL_SENSORS, Options
 from hydrotele.envs.variants import typical_variation
@@ -71,7 +71,7 @@ def table(name: str, asked) -> list[str]:
                     if kind == "reference" and name not in REFERENCE_CONTROLLERS:
                         continue
                     controller = make_controller(kind, core.setup)
-                    scores = evaluate(core, controller, asked.episodes, asked.seed)
+                    scores = evaluate_controller(core, controller, asked.episodes, asked.seed)
                     if not columns:
                         columns = names(scores)
                         heads = [f"{column} [{scores.units[column]}]" for column in columns]

@@ -20,7 +20,7 @@ from hydrotele.identify.excitation import (
     MachineLimits,
     compute_information,
     design_motion,
-    select_informative_base,
+    select_determinable_parameters,
 )
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import build_records, compute_force_noise
@@ -75,7 +75,7 @@ def main() -> None:
     machine = load_machine("cat215")
     setup = machine_setup(machine, load_closed_chain(machine))
     noise = compute_force_noise(machine, SENSORS)
-    base = select_informative_base(machine, setup, noise)
+    base = select_determinable_parameters(machine, setup, noise)
     old = motion_of(load_scenario(OLD))
     new = design_motion(
         MachineLimits(machine, setup), setup, noise, base, period=old.period,

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 from hydrotele.cli.experimenting import write_comparison_files
-from hydrotele.experiments.comparison import Series, compare_by_seeds
+from hydrotele.experiments.comparison import Series, compare_by_repetition_count
 
 
 def import_series(name: str) -> Series:
@@ -37,7 +37,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     series, counts = import_series(arguments.name), arguments.counts
-    found = compare_by_seeds(series, counts, arguments.jobs, report_progress)
+    found = compare_by_repetition_count(series, counts, arguments.jobs, report_progress)
     if arguments.folder and series.repetitions in counts:
         arguments.folder.mkdir(parents=True, exist_ok=True)
         write_comparison_files(arguments.folder, series, series.repetitions, found[series.repetitions])

@@ -20,7 +20,7 @@ from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.identified_machine import build_identified_machine
 from hydrotele.identify.record import build_records
 from hydrotele.identify.setup import machine_setup
-from hydrotele.kinematics.arm import forward_cartesian, inverse_kinematics
+from hydrotele.kinematics.arm import forward_kinematics_cartesian, inverse_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
@@ -106,7 +106,7 @@ def track(machine: Machine, folder: Path, shape: str, lap: float, model: str | N
     ])  # fmt: skip
     got = np.column_stack([run.truth[f"angle.{a}"] for a in AXES])
     late = run.truth.time > SETTLE
-    tips = [np.array([forward_cartesian(geometry, tuple(q)) for q in rows[late]])
+    tips = [np.array([forward_kinematics_cartesian(geometry, tuple(q)) for q in rows[late]])
             for rows in (got, wanted)]  # fmt: skip
     return float(np.sqrt(np.mean(np.sum((tips[0] - tips[1]) ** 2, axis=1))))
 

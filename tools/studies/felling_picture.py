@@ -16,8 +16,8 @@ from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.pose import (
     compile_visual_model,
-    logged_joints,
-    logged_positions,
+    compute_joint_positions,
+    extract_joint_motion,
     logged_surroundings,
 )
 
@@ -29,7 +29,7 @@ folder, picture = Path(sys.argv[1]), Path(sys.argv[2])
 machine, log = load_machine(folder / "machine.yaml"), load_log(folder / "truth.parquet")
 model = compile_visual_model(machine, surroundings=logged_surroundings(log))
 rows = np.searchsorted(log.time, MOMENTS)
-positions = logged_positions(machine, model, logged_joints(machine, log), log)[rows]
+positions = compute_joint_positions(machine, model, extract_joint_motion(machine, log), log)[rows]
 data, camera = mujoco.MjData(model), mujoco.MjvCamera()
 camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (4.0, 1.5, 3.2), 18, 125, -12
 renderer = mujoco.Renderer(model, SIZE[1], SIZE[0])

@@ -106,7 +106,7 @@ def delayed(delay: float, damping: float, seed: int) -> tuple[float, float, floa
     handle = station.log.master("handle")[:, 2]
     last, late = force[2 * len(force) // 3 :], handle[2 * len(handle) // 3 :]
     low, high = np.percentile(last, [5.0, 95.0])
-    margin = analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.theorem_margin
+    margin = analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.stability_theorem_margin
     return 0.5 * float(high - low) / TARGET, float(np.std(late)), margin
 
 
@@ -188,9 +188,9 @@ def held_table(found: list) -> list[str]:
 
 def draw(bare: list, path: Path) -> None:
     """Limits, predicted and simulated; contact forces of both structures."""
-    from hydrotele.show.report_html import png, report_figure
+    from hydrotele.show.report_html import figure_to_png, open_report_figure
 
-    with report_figure(3.2) as figure:
+    with open_report_figure(3.2) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))
         table = np.array([(one[0], one[3]) for one in bare])
         table = table[np.isfinite(table[:, 1]) & (table[:, 1] > 0.0)]
@@ -207,7 +207,7 @@ def draw(bare: list, path: Path) -> None:
         right.axhline(1e-3 * TARGET, color="#8a94a0", lw=1, ls=":")
         right.set(xlabel="time [s]", ylabel="contact force [kN]")
         right.legend(loc="upper left", frameon=False)
-        path.write_bytes(png(figure))
+        path.write_bytes(figure_to_png(figure))
 
 
 def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -> str:

@@ -12,18 +12,18 @@ from hydrotele.calibrate.hybrid import (
     PoseEquations,
     build_equations,
     calibrate_hybrid_robot,
-    fitted_equations,
+    restrict_to_fitted_parameters,
     select_informative_poses,
 )
 from hydrotele.calibrate.hybrid_data import measurement_from_wires
 from hydrotele.calibrate.posterior import sample_posterior
 from hydrotele.experiments.wang_robots import (
     SENSOR_NOISE,
-    compute_test_errors,
+    compute_test_pose_errors,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import (
-    apply_errors,
+    apply_geometry_errors,
     build_error_model,
     forward_kinematics,
     load_hybrid,
@@ -54,8 +54,8 @@ def coverage(trials: int) -> None:
         deviations.append(fit.standard_deviations)
         low, high = fit.intervals.T
         inside.append((one.errors[at] > low) & (one.errors[at] < high))
-        before.append(compute_test_errors(one, IWR)[0])
-        after.append(compute_test_errors(one, done.robot)[0])
+        before.append(compute_test_pose_errors(one, IWR)[0])
+        after.append(compute_test_pose_errors(one, done.robot)[0])
     away = (np.array(found) - truth) / np.array(deviations)
     share = np.mean(inside, axis=0)
     bias = away.mean(axis=0) * np.sqrt(trials)
@@ -97,8 +97,8 @@ def all54(trials: int) -> None:
             inside.append(np.abs(estimate - row @ one.errors) < fit.interval_quantile * size)
             chi.append(fit.chi)
             ranks.add(done.redundancy.rank)
-            before.append(compute_test_errors(one, IWR)[0])
-            after.append(compute_test_errors(one, done.robot)[0])
+            before.append(compute_test_pose_errors(one, IWR)[0])
+            after.append(compute_test_pose_errors(one, done.robot)[0])
         print(
             f"{trials} trials, {kind}, 54 errors, rank {ranks}: 95 % intervals of the"
             f" combinations contain {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
@@ -114,7 +114,7 @@ def noise(trials: int) -> None:
         for seed in range(trials):
             one = simulate_robot(5000 + seed, 25, noise=factor)
             done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
-            errors.append(compute_test_errors(one, done.robot)[0])
+            errors.append(compute_test_pose_errors(one, done.robot)[0])
         print(f"| {factor:g} x | {1e3 * np.sqrt(np.mean(np.square(errors))):.4f} | {1e3 * np.max(errors):.4f} |")
 
 
@@ -129,9 +129,9 @@ def poses(trials: int) -> None:
             begin = time.process_time()
             done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
             took += time.process_time() - begin
-            errors.append(compute_test_errors(one, done.robot)[0])
+            errors.append(compute_test_pose_errors(one, done.robot)[0])
             other = simulate_robot(6500 + seed, count, refined_only=False)
-            whole.append(compute_test_errors(other, calibrate_hybrid_robot(IWR, other.measurement, "dh").robot)[0])
+            whole.append(compute_test_pose_errors(other, calibrate_hybrid_robot(IWR, other.measurement, "dh").robot)[0])
         sizes = [1e3 * np.sqrt(np.mean(np.square(e))) for e in (errors, whole)]
         print(f"| {count} | {sizes[0]:.4f} | {sizes[1]:.4f} | {took / trials:.2f} |")
 
@@ -143,7 +143,7 @@ def choice(trials: int) -> None:
     for seed in range(trials):
         rng = np.random.default_rng([77, seed])
         planted = sample_manufacturing_errors(model, rng)
-        built = apply_errors(model, planted)
+        built = apply_geometry_errors(model, planted)
         joints, legs = sample_poses(IWR, 200, rng, wires)
         lengths = wire_lengths(wires, forward_kinematics(IWR, joints, legs))
         exact = measurement_from_wires(IWR, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
@@ -167,7 +167,7 @@ def posterior(trials: int) -> None:
     for seed in range(trials):
         one = simulate_robot(7000 + seed, 25)
         done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
-        eq, fit = fitted_equations(done), done.fit
+        eq, fit = restrict_to_fitted_parameters(done), done.fit
         sample = sample_posterior(
             lambda x, eq=eq: -eq.negative_log_likelihood(x), fit.values, fit.covariance, eq.names, steps=4000,
             burn_in=500, seed=seed,

@@ -7,8 +7,8 @@ of the drives, friction of joints and pins. The motion is 300 independent random
 cylinders end in pins, or in ball joints that carry no moment about the cylinders' axes.
 """
 
-from hydrotele.experiments.khoshzaban_dynamics import TABLE_13, count_parameters
-from hydrotele.experiments.khoshzaban_models import find_base
+from hydrotele.experiments.khoshzaban_dynamics import TABLE_13, count_identifiability_classes
+from hydrotele.experiments.khoshzaban_models import find_base_parameters
 from tools.studies.study import options, publish
 
 ENDS = (("ball joints (Eq. 4.23)", True), ("pins", False))
@@ -16,7 +16,7 @@ ENDS = (("ball joints (Eq. 4.23)", True), ("pins", False))
 
 def report() -> str:
     """The tables."""
-    bases = {said: find_base("complete", ball) for said, ball in ENDS}
+    bases = {said: find_base_parameters("complete", ball) for said, ball in ENDS}
     lines = [
         "This study counts the identifiable parameters of the CAT 215 (82 parameters) and compares"
         " them with Table 13 of Khoshzaban 1992. The motion is 300 independent random states.",
@@ -27,7 +27,7 @@ def report() -> str:
         "| Khoshzaban, Table 13 | | " + " | ".join(map(str, TABLE_13.values())) + " | |",
     ]
     for said, base in bases.items():
-        counts = " | ".join(str(n) for n in count_parameters(base.classification).values())
+        counts = " | ".join(str(n) for n in count_identifiability_classes(base.classification).values())
         gap = "{:.1g}, {:.1g}".format(*base.classification.singular_value_gap)
         lines.append(f"| {said} | {len(base.classification.base)} | {counts} | {gap} |")
     lines += ["", TEXT, "", "Fully identifiable parameters:", ""]

@@ -17,13 +17,13 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor, coil_force_factors
 from hydrotele.teleop.coils import make_three_station_coils, relative_heating, time_to_overheat
 from hydrotele.teleop.compliance import Flotor, quaternion_to_matrix
-from hydrotele.teleop.flotor import FlotorFit, identify_flotor
+from hydrotele.teleop.flotor import FlotorFit, identify_flotor_parameters
 from hydrotele.teleop.levitation import (
     LevitationRun,
     make_excitation_path,
     make_levitation_control,
     pose_resolution,
-    quaternion_to_vector,
+    quaternion_to_rotation_vector,
     second_order_step_response,
     simulate_levitation,
 )
@@ -31,9 +31,9 @@ from hydrotele.teleop.master import build_master, step_master
 from hydrotele.teleop.sampled import (
     make_spinning_body,
     make_tilting_body,
-    max_loop_eigenvalue,
-    max_stable_damping,
-    min_stable_inertia,
+    max_sampled_handle_eigenvalue,
+    max_stable_handle_damping,
+    min_stable_handle_inertia,
 )
 from tools.studies.handle_laws import Detent
 from tools.studies.study import options, publish, side_by_side
@@ -143,7 +143,7 @@ def identified(seed: int, diodes: bool = False) -> tuple[FlotorFit, LevitationRu
         seed=seed,
         diodes=diodes,
     )
-    fit = identify_flotor(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
+    fit = identify_flotor_parameters(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
     return fit, flight
 
 
@@ -284,7 +284,7 @@ def travel() -> list[str]:
         if axis < 3:
             shown = f"{1e3 * (coils_moved(qpos)[axis] - limits.translation):.3f} mm"
         else:
-            deep = quaternion_to_vector(qpos[3:7])[axis - 3] - limits.rotation
+            deep = quaternion_to_rotation_vector(qpos[3:7])[axis - 3] - limits.rotation
             shown = f"{np.rad2deg(deep):.3f} deg"
         lines.append(f"| {name} | {shown} |")
     qpos = pushed(np.array([20.0, 0, 0, 0, 0, 0]))
@@ -320,7 +320,7 @@ def damping() -> list[str]:
             for rate in (200.0, 1000.0):
                 springs, dampers = np.array([stiff, turn]), np.array([60.0, damped])
                 decays = [
-                    max_loop_eigenvalue(
+                    max_sampled_handle_eigenvalue(
                         make_tilting_body(f.mass, arm, f.inertia[0], held),
                         springs,
                         dampers,
@@ -329,12 +329,12 @@ def damping() -> list[str]:
                     for held in ((0.0,) * 5, HELD)
                 ]
                 spin = make_spinning_body(f.inertia[2])
-                decays.append(max_loop_eigenvalue(spin, np.array([about]), dampers[1:], 1 / rate))
+                decays.append(max_sampled_handle_eigenvalue(spin, np.array([about]), dampers[1:], 1 / rate))
                 cells = " | ".join(f"{d:.3f}" for d in decays)
                 lines.append(f"| {name} | {damped:g} ({what}) | {rate:g} | {cells} |")
-    needed = [min_stable_inertia(rub, about, PERIOD) for _, _, about, rub in printed.values()]
+    needed = [min_stable_handle_inertia(rub, about, PERIOD) for _, _, about, rub in printed.values()]
     radii = [1e3 * np.sqrt(i / f.mass) for i in needed]
-    fast = [min_stable_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
+    fast = [min_stable_handle_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
     return [
         *lines, "",
         "Half: the damper acts on the rate of the Euler vector of 5.1.3, which is half of the "
@@ -347,7 +347,7 @@ def damping() -> list[str]:
         f"{1e3 * JOYSTICK.coils.radius:g} mm. The library's flotor has {1e3 * f.inertia[0]:g} and "
         f"{1e3 * f.inertia[2]:g} g m^2. At 1 kHz, {1e3 * fast[0]:.1f} and {1e3 * fast[1]:.1f} g "
         "m^2 would be enough. The largest damping at which rz of this flotor is stable at 200 Hz "
-        f"with 6 N m/rad is {max_stable_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
+        f"with 6 N m/rad is {max_stable_handle_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
         "",
     ]  # fmt: skip
 
@@ -434,7 +434,7 @@ def held(spin: np.ndarray, change: np.ndarray) -> np.ndarray:
     muscles[2] = 9.81 * JOYSTICK.hand.mass
     for k in range(len(spin)):
         pose[k, :3] = flotor.data.qpos[:3]
-        pose[k, 3:] = quaternion_to_vector(flotor.data.qpos[3:7])
+        pose[k, 3:] = quaternion_to_rotation_vector(flotor.data.qpos[3:7])
         step_master(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
         flotor.step_in_cab(s.currents, muscles, np.array(JOYSTICK.mount), float(spin[k]), float(change[k]))
     return pose

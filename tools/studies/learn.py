@@ -19,9 +19,9 @@ import numpy as np
 from hydrotele.envs.controllers.catalogue import make_controller, tune_gains
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.controllers.track import TrackByValves
-from hydrotele.envs.core import TaskCore, make_setup
+from hydrotele.envs.core import TaskCore, make_task_setup
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.evaluation import Scores, compare_scores, evaluate
+from hydrotele.envs.evaluation import Scores, evaluate_controller, tabulate_scores
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.stable_baselines import AgentInterface
@@ -112,9 +112,9 @@ class Learned:
         self.begin, self.reset = view.begin, view.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        seen = (self._view.observe(observation) - self._mean) / self._scale
+        seen = (self._view.make_agent_observation(observation) - self._mean) / self._scale
         seen = np.clip(seen, -self._most, self._most).astype(np.float32)
-        return self._view.convert_action(self._policy.predict(seen, deterministic=True)[0])
+        return self._view.make_environment_action(self._policy.predict(seen, deterministic=True)[0])
 
 
 class Clock(BaseCallback):
@@ -171,7 +171,7 @@ def train(name: str, asked: argparse.Namespace) -> None:
     """Learn, and write the policy."""
     recipe, task = RECIPES[name], TASKS[name]
     taken = {**choices(name, asked.variants), "variant_seed": TRAINED, "duration": recipe.seconds}
-    setup = make_setup(task, Options(**taken))
+    setup = make_task_setup(task, Options(**taken))
     plain = StableVecEnv(name, asked.envs, asked.threads, make_view(name, setup), **taken)
     plain.seed(asked.seed)
     env = VecNormalize(plain, gamma=recipe.gamma)
@@ -201,7 +201,7 @@ def judge(name: str, asked: argparse.Namespace) -> list[tuple[str, Scores]]:
         "reference with default gains": make_controller("reference", core.setup),
         "zero": make_controller("zero", core.setup),
     }
-    return [(k, evaluate(core, c, asked.episodes, FIRST)) for k, c in controllers.items()]
+    return [(k, evaluate_controller(core, c, asked.episodes, FIRST)) for k, c in controllers.items()]
 
 
 def tuned(name: str, asked: argparse.Namespace) -> Gains:
@@ -211,7 +211,7 @@ def tuned(name: str, asked: argparse.Namespace) -> Gains:
     core = TaskCore(TASKS[name], Options(**taken), asked.envs, asked.threads, DISABLED)
 
     def value(gains: Gains) -> float:
-        found = evaluate(core, recipe.law(core.setup, gains), asked.envs, asked.seed).mean("return")
+        found = evaluate_controller(core, recipe.law(core.setup, gains), asked.envs, asked.seed).mean("return")
         said = ", ".join(f"{key} {number:.4g}" for key, number in gains.items())
         print(f"{found:8.2f}  {said}", file=sys.stderr, flush=True)
         return found
@@ -248,7 +248,7 @@ def main() -> None:
     scores = judge(asked.task, asked)
     figures = ["return", RECIPES[asked.task].figure]
     lines = [
-        compare_scores(scores, figures),
+        tabulate_scores(scores, figures),
         "",
         "Learned controller minus tuned reference, paired by episode:\n",
     ]

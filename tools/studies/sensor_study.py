@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.identify.equations import build_equations, concatenate_field
-from hydrotele.identify.estimation import estimate
+from hydrotele.identify.equations import build_equations, concatenate_over_runs
+from hydrotele.identify.estimation import estimate_linear_parameters
 from hydrotele.identify.identifiability import classify_parameters, reference_sizes
 from hydrotele.identify.motion import Processing, estimate_resolution
 from hydrotele.identify.record import IdentificationRecord, build_records
@@ -43,7 +43,7 @@ def noisy_force(record: IdentificationRecord, machine: Machine, level: float, rn
     """Forces (n, k) of a record of true values with uniform errors of the pressures [Pa]."""
     rows, force = len(record.force), record.force.copy()
     for k, axis in enumerate(record.axes):
-        head, rod = machine.axes[axis].hydraulic_drive.areas
+        head, rod = machine.axes[axis].hydraulic_drive.effective_areas
         force[:, k] += head * rng.uniform(-level, level, rows)
         force[:, k] -= rod * rng.uniform(-level, level, rows)
     return force
@@ -61,8 +61,8 @@ def measured_motion(setup: RegressorSetup, records_of: list[IdentificationRecord
         made.append(build_equations(one, setup, Processing(band=BAND), resolved))
     runs = [e for e, _ in made]
     return (
-        concatenate_field(runs, lambda e: e.matrix),
-        concatenate_field(runs, lambda e: e.force),
+        concatenate_over_runs(runs, lambda e: e.matrix),
+        concatenate_over_runs(runs, lambda e: e.force),
         made[0][1],
     )
 
@@ -106,7 +106,7 @@ def one_trial(seed: int, number: int) -> dict[tuple[str, str, str], dict[str, fl
                 flat = matrix.reshape(-1, matrix.shape[2])
                 told = classify_parameters(flat, table.names, table.units)
                 sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)))
-                found = estimate(matrix[:, :, told.base], force, order=0)
+                found = estimate_linear_parameters(matrix[:, :, told.base], force, order=0)
                 truth = told.combination @ table.nominal
                 away = np.abs(found.value - truth) / sizes[told.base]
                 names = [table.names[b] for b in told.base]

@@ -19,7 +19,7 @@ from hydrotele.teleop.sampled import (
     measured_delay_ages,
     predict_stability,
 )
-from hydrotele.teleop.sampled_run import simulate_kick
+from hydrotele.teleop.sampled_run import simulate_initial_velocities
 from hydrotele.teleop.switching import StiffnessAxis
 from hydrotele.teleop.two_port import STRUCTURES, Impedance, StructureGains
 from tools.studies.study import options, publish, side_by_side
@@ -127,7 +127,7 @@ def trial(seed: int, number: int) -> list[Row]:
             k = k if found is None else aside * found
         told = predict_stability(*scaled_for(case, name, line, k, linear))
         one, back_factor = scaled(case, k, linear)
-        motion = simulate_kick(one, name, period, there[count:], back[count:], back_factor)
+        motion = simulate_initial_velocities(one, name, period, there[count:], back[count:], back_factor)
         sides = [predict_stability(*scaled_for(case, name, line, m * k, linear)).is_stable
                  for m in (1.0 - NEAR, 1.0 + NEAR)]  # fmt: skip
         held, touching = bool(case.hand.mass), bool(case.task.stiffness)
@@ -189,7 +189,7 @@ def robust_table(period: float = 0.005, pairs: int = 100) -> list[str]:
             f"| `{name}` | {told[0]}, {told[1]} | {told[2]}, {told[3]} | {alone} |"
             f" {pairs - worst.unstable_count} of {pairs} | {pairs - worst.unstable_released_count} of {pairs} |"
             f" {'-' if np.isnan(one.llewellyn) else f'{one.llewellyn:.3g}'} |"
-            f" {f'{one.z_width_result.decades:.2f}' if one.z_width_result else '-'} |"
+            f" {f'{one.z_width_result.mean_width_decades:.2f}' if one.z_width_result else '-'} |"
         )
     return lines
 
@@ -211,7 +211,7 @@ def spring_table() -> list[str]:
                 lines.append(
                     f"| {gains} | {axis} | {name} | {one.damping:g} | {one.mass:g} |"
                     f" {one.min_stiffness:g} | {one.max_stiffness:g}"
-                    f" | {one.theorem_margin:.0f} | {one.theorem_damping:.0f}"
+                    f" | {one.stability_theorem_margin:.0f} | {one.stability_theorem_damping:.0f}"
                     f" | {one.half_swing_growth:.2f} | {one.min_stable_damping:.0f} | {one.stability_criterion} |"
                 )
     return lines

@@ -65,7 +65,7 @@ class Pressures:
         axes = [machine.axes[n] for n in actuator_order(machine) if machine.axes[n].is_hydraulic]
         self.least, self.most, self.beyond = np.inf, -np.inf, -np.inf
         self._count = len(axes)
-        self._areas = np.array([a.hydraulic_drive.areas for a in axes]).reshape(-1, 2)
+        self._areas = np.array([a.hydraulic_drive.effective_areas for a in axes]).reshape(-1, 2)
         self._port = np.array([a.valve.port_relief if a.valve else np.inf for a in axes])
         self._gain = np.array([a.valve.port_relief_gain if a.valve else 1.0 for a in axes])
         self._leak = np.array([a.hydraulic_drive.leakage for a in axes])

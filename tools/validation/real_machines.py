@@ -28,7 +28,7 @@ from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment, load
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import NO_DRIVES, DriveState
-from hydrotele.terms.table import FORCE, sum_terms, terms_table
+from hydrotele.terms.table import FORCE, encode_terms_table, sum_terms
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
@@ -64,7 +64,7 @@ def force_error(machine: Machine, run: RunData, cutoff: float) -> float:
 
 def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Forces (n,) that learned laws and other terms add to the drive along a motion [N]."""
-    total, table = np.zeros(len(rate)), terms_table(machine.terms, ["slide"])
+    total, table = np.zeros(len(rate)), encode_terms_table(machine.terms, ["slide"])
     nothing = DriveState(*[0.0] * len(DriveState._fields))
     for row, (x, v) in enumerate(zip(position, rate, strict=True)):
         command = float(run.command[row, 0])

@@ -1,6 +1,6 @@
 """Controller protocol, zero and random controllers, and the joint servo for valve actions.
 
-`find_columns` finds the observation columns of named fields. `ValveServo` computes valve commands at the
+`find_observation_columns` finds the observation columns of named fields. `ValveServo` computes valve commands at the
 environment rate with the joint servo of `control.servo`: velocity feedforward through the flow gain
 at the measured pressures, dead-band compensation, position feedback and dynamic pressure feedback.
 Its integral term compensates leakage and deviations of dead band and flow gain from the nominal
@@ -19,12 +19,12 @@ from hydrotele.control.servo import (
     interpolate_drive_reference,
     servo_parameters,
     servo_step,
-    tabulate_drives,
+    tabulate_drive_geometry,
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.facts import TaskSetup
-from hydrotele.kinematics.task import task_forward, task_inverse
+from hydrotele.kinematics.task import compute_tip_pose, solve_joint_angles
 from hydrotele.scenario.scenario import Servo
 
 
@@ -92,12 +92,12 @@ class RandomController:
         return self._rng.uniform(-1.0, 1.0, (len(observation), self._actions))
 
 
-def step_time(setup: TaskSetup) -> float:
+def environment_step_time(setup: TaskSetup) -> float:
     """Return the time between environment steps [s]."""
     return setup.clock.ticks * setup.clock.period
 
 
-def find_columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
+def find_observation_columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
     """Return the columns of the observation that hold the fields named `<what>.<where>`.
 
     Args:
@@ -121,16 +121,16 @@ def find_columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarra
 def find_position_columns(setup: TaskSetup) -> np.ndarray:
     """Return the observation columns (k,) of the measured positions of the driven axes."""
     return np.concatenate([
-        find_columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes
+        find_observation_columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes
     ])  # fmt: skip
 
 
 @compiled
-def compute_servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
+def compute_servo_commands(servo_parameters, grid, table, reference, rate_ahead, measured, load, out):
     """Compute the valve or drive commands of the joint servo for n episodes.
 
     Args:
-        numbers: (k, 14) of `control.servo.servo_parameters`.
+        servo_parameters: (k, 14) of `control.servo.servo_parameters`.
         grid: (k, 2) of `control.servo.tabulate_drives`.
         table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drives`.
         reference: (n, k) [rad] or [m].
@@ -144,7 +144,7 @@ def compute_servo_commands(numbers, grid, table, reference, rate_ahead, measured
 
     Source: `control.servo.servo_step`.
     """
-    k = len(numbers)
+    k = len(servo_parameters)
     closed, none = np.ones(k), np.zeros(k)
     velocity, arm, volume_head, volume_rod = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
     for i in range(len(reference)):
@@ -157,11 +157,11 @@ def compute_servo_commands(numbers, grid, table, reference, rate_ahead, measured
             measured.joint[i], measured.rate[i], measured.head[i], measured.rod[i],
             measured.supply[i],
         )  # fmt: skip
-        servo_step(numbers, closed, drive, reference[i], now, load[i], computed, out[i])
+        servo_step(servo_parameters, closed, drive, reference[i], now, load[i], computed, out[i])
 
 
 @compiled
-def compute_poses(arm, q, pose):
+def compute_tip_poses(arm, q, pose):
     """Compute the tip poses of n episodes from their joint angles.
 
     Args:
@@ -175,7 +175,7 @@ def compute_poses(arm, q, pose):
     Source: `kinematics.task.task_forward`.
     """
     for i in range(len(q)):
-        task_forward(arm, q[i], pose[i])
+        compute_tip_pose(arm, q[i], pose[i])
 
 
 @compiled
@@ -196,7 +196,7 @@ def compute_joint_angles(arm, ranges, pose, q):
     k = q.shape[1]
     found = np.empty(k)
     for i in range(len(q)):
-        good = task_inverse(arm, pose[i], q[i, 0], found) == 0
+        good = solve_joint_angles(arm, pose[i], q[i, 0], found) == 0
         for j in range(k):
             good = good and ranges[j, 0] <= found[j] <= ranges[j, 1]
         if good:
@@ -217,18 +217,18 @@ class ValveServo:
             servo: gains of the joint servo.
             integral_gain: gain of the integral term [1/s^2].
         """
-        machine, self._dt = setup.machine, step_time(setup)
+        machine, self._dt = setup.machine, environment_step_time(setup)
         self._axes, self._integral_gain = setup.axes, integral_gain
         self._parameters = servo_parameters(machine, setup.axes, servo, self._dt)
-        self._grid, self._table = tabulate_drives(machine, setup.axes)
+        self._grid, self._table = tabulate_drive_geometry(machine, setup.axes)
         valves = [i for i, name in enumerate(setup.axes) if machine.axes[name].is_hydraulic]
         names = [setup.axes[i] for i in valves]
         self._valves = np.array(valves, int)
         self._joint = find_position_columns(setup)
-        self._rate = find_columns(setup, "rate", setup.axes)
-        self._head = find_columns(setup, "pressure_head", names)
-        self._rod = find_columns(setup, "pressure_rod", names)
-        self._supply = find_columns(setup, "pressure_supply", [""] if names else [])
+        self._rate = find_observation_columns(setup, "rate", setup.axes)
+        self._head = find_observation_columns(setup, "pressure_head", names)
+        self._rod = find_observation_columns(setup, "pressure_rod", names)
+        self._supply = find_observation_columns(setup, "pressure_supply", [""] if names else [])
 
     def begin(self, count: int) -> None:
         """Allocate the controller state for `count` parallel episodes."""

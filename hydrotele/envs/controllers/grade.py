@@ -11,9 +11,9 @@ from hydrotele.envs.controllers.controller import (
     Controller,
     ValveServo,
     compute_joint_angles,
-    find_columns,
+    environment_step_time,
+    find_observation_columns,
     find_position_columns,
-    step_time,
 )
 from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import MAX_ARM_AXES
@@ -23,7 +23,7 @@ from hydrotele.envs.facts import (
     TaskSetup,
     full_action_rate,
 )
-from hydrotele.envs.grade import MAX_RADIUS, MEAN_RADIUS, MIN_RADIUS, SECTION_COUNT, section_radii
+from hydrotele.envs.grade import MAX_RADIUS, MEAN_RADIUS, MIN_RADIUS, SECTION_COUNT, profile_section_radii
 
 _INTEGRAL_GAIN = 2.0  # 1/s^2, integral gain of valve actions
 _JOINT_GAINS = (6.0, 1.0)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction
@@ -37,9 +37,9 @@ class PoseFollower:
         """Read the parameters of the controller from the nominal machine."""
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_specification(setup.machine)
-        self._dt, self._k = step_time(setup), k
+        self._dt, self._k = environment_step_time(setup), k
         self._tip, self._joint = (
-            find_columns(setup, "tip", COORDINATES[:k]),
+            find_observation_columns(setup, "tip", COORDINATES[:k]),
             find_position_columns(setup),
         )
         self._valve_servo = self._rate_feedback = None
@@ -76,7 +76,7 @@ class PoseFollower:
         """
         if self._uses_pose_rates:
             assert self._rate_feedback
-            return self._rate_feedback.compute_rates(observation[:, self._tip].astype(float), pose, rate)
+            return self._rate_feedback.compute_rate_commands(observation[:, self._tip].astype(float), pose, rate)
         measured = observation[:, self._joint].astype(float)
         self._q[self._is_new], self._is_new[:] = measured[self._is_new], False
         before, full = self._q.copy(), np.zeros((len(pose), MAX_ARM_AXES))
@@ -86,7 +86,7 @@ class PoseFollower:
         if self._valve_servo:
             return self._valve_servo(observation, self._q, speed)
         assert self._rate_feedback
-        return self._rate_feedback.compute_rates(measured, self._q, speed)
+        return self._rate_feedback.compute_rate_commands(measured, self._q, speed)
 
 
 APPROACH, LOWER, DRAW, CURL, CARRY, DUMP = range(6)
@@ -133,14 +133,14 @@ class GradeController:
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
-        self._tip = find_columns(setup, "tip", COORDINATES[:4])
-        self._errors = find_columns(setup, "profile_error", [str(p) for p in range(SECTION_COUNT)])
+        self._tip = find_observation_columns(setup, "tip", COORDINATES[:4])
+        self._errors = find_observation_columns(setup, "profile_error", [str(p) for p in range(SECTION_COUNT)])
         self._mass, self._edge, self._plane, self._slope = (
-            find_columns(setup, name, [""])[0]
+            find_observation_columns(setup, name, [""])[0]
             for name in ("carried_mass", "edge_height", "plane_height", "plane_slope")
         )
-        self._follower, self._dt = PoseFollower(setup), step_time(setup)
-        self._radii = np.array(section_radii())
+        self._follower, self._dt = PoseFollower(setup), environment_step_time(setup)
+        self._radii = np.array(profile_section_radii())
 
     def begin(self, count: int) -> None:
         """Allocate the controller state for `count` parallel episodes."""
@@ -164,7 +164,7 @@ class GradeController:
         self._reference[fresh], self._reference_rate[fresh] = tip[fresh], 0.0
         self._theta[fresh], self._is_new = seen[fresh, self._tip[1]], np.zeros(len(seen), bool)
         self._update_phases(tip, errors, seen[:, self._mass], seen[:, self._edge])
-        goal, fast = self._compute_targets(seen, errors)
+        goal, fast = self._compute_phase_targets(seen, errors)
         self._advance_reference(goal, fast, tip)
         pose = np.insert(self._reference, 1, self._theta, axis=1)
         return self._follower(seen, pose, np.insert(self._reference_rate, 1, 0.0, axis=1))
@@ -202,7 +202,7 @@ class GradeController:
         phase[done] = (phase[done] + 1) % 6
         self._phase_time[done] = 0.0
 
-    def _compute_targets(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _compute_phase_targets(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the targets (n, 3) of the phase: r [m], z [m], attitude [rad], and the maximum rates (n, 3)."""
         phase, place = self._phase, self._reference
 

@@ -13,9 +13,9 @@ from hydrotele.envs.controllers.controller import (
     Controller,
     ValveServo,
     compute_joint_angles,
-    find_columns,
+    environment_step_time,
+    find_observation_columns,
     find_position_columns,
-    step_time,
 )
 from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import MAX_ARM_AXES
@@ -43,7 +43,7 @@ APPROACH, DESCEND, CLOSE, LIFT, SLEW, LOWER, RELEASE, LEAVE = range(8)
 _PAUSES = np.array([1.0, 0.3, 0.5, 0.5, 1.0, 0.3, 0.3, 1.0])  # s after every phase
 
 
-def move_fraction(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.ndarray:
+def trapezoidal_move_fraction(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.ndarray:
     """Return the completed fraction of a move with trapezoidal speed.
 
     Args:
@@ -68,9 +68,11 @@ def _wrap_angle(angle: np.ndarray, period: float) -> np.ndarray:
     return angle - period * np.round(angle / period)
 
 
-def find_pin_columns(setup: TaskSetup) -> np.ndarray:
+def find_pin_and_grapple_columns(setup: TaskSetup) -> np.ndarray:
     """Return the observation columns (5,) of the pin at the stick's tip (r, theta, z), grapple rotation and jaw."""
-    return np.concatenate([find_columns(setup, "tip", ("r", "theta", "z")), find_position_columns(setup)[3:]])
+    return np.concatenate(
+        [find_observation_columns(setup, "tip", ("r", "theta", "z")), find_position_columns(setup)[3:]]
+    )
 
 
 class MovePlanner:
@@ -79,13 +81,13 @@ class MovePlanner:
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the nominal machine and the observation columns."""
         self._lateral_offset = float(arm_specification(setup.machine)[0][2])
-        self._tip = find_pin_columns(setup)
-        self._log = find_columns(setup, "log", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
-        self._goal = find_columns(setup, "goal", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
-        self._held = find_columns(setup, "held", [""])[0]
+        self._tip = find_pin_and_grapple_columns(setup)
+        self._log = find_observation_columns(setup, "log", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
+        self._goal = find_observation_columns(setup, "goal", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
+        self._held = find_observation_columns(setup, "held", [""])[0]
         rates = [full_action_rate(setup.machine, name) for name in setup.axes[3:]]
         self._speeds = np.minimum(_MAX_RATES, 0.8 * np.array([*setup.task.pose_rates[:3], *rates]))
-        self._dt = step_time(setup)
+        self._dt = environment_step_time(setup)
 
     def begin(self, count: int) -> None:
         """Allocate the controller state for `count` parallel episodes."""
@@ -112,12 +114,12 @@ class MovePlanner:
         self._phase[over] = self._next_phases(seen)[over]
         self._plan_moves(seen, over)
 
-    def reference_at(self, ahead: float) -> np.ndarray:
+    def reference_ahead(self, ahead: float) -> np.ndarray:
         """Return the reference (n, 5) `ahead` [s] from now.
 
         The columns are r [m], theta [rad], z [m] of the pin, grapple rotation [rad] and jaw [rad].
         """
-        share = move_fraction(self._time + ahead, self._length, self._ramp)[:, None]
+        share = trapezoidal_move_fraction(self._time + ahead, self._length, self._ramp)[:, None]
         return self._move_start + share * (self._move_end - self._move_start)
 
     def _next_phases(self, seen: np.ndarray) -> np.ndarray:
@@ -133,9 +135,9 @@ class MovePlanner:
         phase, goes = self._phase[which], self._move_end[which].copy()
         to, seen = goes.copy(), seen[which]
         rows = phase == APPROACH
-        to[rows] = self._target_over_log(seen[rows], goes[rows])
+        to[rows] = self._plan_grip_target(seen[rows], goes[rows])
         rows = (phase == SLEW) | (phase == LOWER)
-        to[rows] = self._target_over_goal(seen[rows], goes[rows])
+        to[rows] = self._plan_lay_down_target(seen[rows], goes[rows])
         for chosen, column, value in (
             (DESCEND, _Z, GRIP_HEIGHT), (CLOSE, _JAW, CLOSED_JAW_ANGLE), (LIFT, _Z, CARRY_HEIGHT), (LOWER, _Z,
             LAY_DOWN_HEIGHT),
@@ -148,15 +150,15 @@ class MovePlanner:
         self._ramp[which] = np.where(swings, SWING_PERIOD, 0.5)
         self._time[which] = 0.0
 
-    def _swing_angle(self, r: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    def _swing_angle_of_pin(self, r: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """Return the swing axis angle [rad] for a pin at r [m], theta [rad]; the arm has a lateral offset."""
         return theta - np.arcsin(self._lateral_offset / r)
 
-    def _target_over_log(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
+    def _plan_grip_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
         """Return the target (m, 5) of the open grapple above the log, aligned with it; `goes` is the last target."""
         r, theta, sine, cosine = seen[:, self._log].T
         to = goes.copy()
-        swing = self._swing_angle(r, theta)
+        swing = self._swing_angle_of_pin(r, theta)
         # the axis of the pocket is across the arm; it rotates with the house, against its motor
         turn = swing + 0.5 * math.pi - 0.5 * np.arctan2(sine, cosine)
         to[:, _ROTATION] = goes[:, _ROTATION] + _wrap_angle(turn - goes[:, _ROTATION], math.pi)
@@ -167,12 +169,12 @@ class MovePlanner:
         to[:, _Z], to[:, _JAW] = CLEARANCE_HEIGHT, OPEN_JAW_ANGLE
         return to
 
-    def _target_over_goal(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
+    def _plan_lay_down_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
         """Return the target (m, 5) that brings the held log over its goal with the goal yaw."""
         r, theta, sine, cosine = seen[:, self._log].T
         goal_r, goal_theta, goal_sine, goal_cosine = seen[:, self._goal].T
         now, to = seen[:, self._tip], goes.copy()
-        slewed = self._swing_angle(goal_r, goal_theta) - self._swing_angle(now[:, _R], now[:, _THETA])
+        slewed = self._swing_angle_of_pin(goal_r, goal_theta) - self._swing_angle_of_pin(now[:, _R], now[:, _THETA])
         yaw = 0.5 * (np.arctan2(goal_sine, goal_cosine) - np.arctan2(sine, cosine))
         turn = _wrap_angle(slewed - yaw, math.pi)
         to[:, _ROTATION] = now[:, _ROTATION] + turn
@@ -192,8 +194,8 @@ class PlaceByTip:
         """Read the parameters of the controller from the nominal machine."""
         self.planner, self._tip, self._dt = (
             MovePlanner(setup),
-            find_pin_columns(setup),
-            step_time(setup),
+            find_pin_and_grapple_columns(setup),
+            environment_step_time(setup),
         )
         rates = [full_action_rate(setup.machine, name) for name in setup.axes[3:]]
         change = np.array([*MAX_POSE_ACCELERATIONS[:3], MAX_ACCELERATION, MAX_ACCELERATION])
@@ -214,9 +216,9 @@ class PlaceByTip:
         """Compute the actions (n, 5) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         self.planner.update(seen)
-        now = self.planner.reference_at(0.0)
-        rate = (now - self.planner.reference_at(-self._dt)) / self._dt
-        return self._rate_feedback.compute_rates(seen[:, self._tip], now, rate)
+        now = self.planner.reference_ahead(0.0)
+        rate = (now - self.planner.reference_ahead(-self._dt)) / self._dt
+        return self._rate_feedback.compute_rate_commands(seen[:, self._tip], now, rate)
 
 
 class PlaceByAxes:
@@ -225,7 +227,7 @@ class PlaceByAxes:
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the controller from the nominal machine."""
         self.planner, self._joint = MovePlanner(setup), find_position_columns(setup)
-        (self._arm, _, self._ranges), self._dt = arm_specification(setup.machine), step_time(setup)
+        (self._arm, _, self._ranges), self._dt = arm_specification(setup.machine), environment_step_time(setup)
         fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])
         by_valves = setup.options.action == "valve"
         self._valve_servo = ValveServo(setup, setup.task.servo) if by_valves else None
@@ -243,9 +245,9 @@ class PlaceByAxes:
             if part:
                 part.reset(mask)
 
-    def _axis_references(self, ahead: float, joint: np.ndarray) -> np.ndarray:
+    def _axis_references_ahead(self, ahead: float, joint: np.ndarray) -> np.ndarray:
         """Return the axis references (n, 5) `ahead` [s] from now; `joint` (n, 5) is measured."""
-        places, q = self.planner.reference_at(ahead), joint[:, :3].copy()
+        places, q = self.planner.reference_ahead(ahead), joint[:, :3].copy()
         pose = np.zeros((len(places), MAX_ARM_AXES))
         pose[:, :3] = places[:, :3]
         compute_joint_angles(self._arm, self._ranges, pose, q)
@@ -256,13 +258,13 @@ class PlaceByAxes:
         seen = observation.astype(float)
         self.planner.update(seen)
         joint = seen[:, self._joint]
-        now = self._axis_references(0.0, joint)
+        now = self._axis_references_ahead(0.0, joint)
         if self._valve_servo:
-            later = self._axis_references(_PHASE_LEAD + self._dt, joint)
-            rate = (later - self._axis_references(_PHASE_LEAD, joint)) / self._dt
+            later = self._axis_references_ahead(_PHASE_LEAD + self._dt, joint)
+            rate = (later - self._axis_references_ahead(_PHASE_LEAD, joint)) / self._dt
             return self._valve_servo(observation, now, rate)
-        rate = (now - self._axis_references(-self._dt, joint)) / self._dt
-        return self._rate_feedback.compute_rates(joint, now, rate)
+        rate = (now - self._axis_references_ahead(-self._dt, joint)) / self._dt
+        return self._rate_feedback.compute_rate_commands(joint, now, rate)
 
 
 def make_place_controller(setup: TaskSetup) -> Controller:

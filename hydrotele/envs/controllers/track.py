@@ -14,10 +14,10 @@ from hydrotele.envs.controllers.controller import (
     Controller,
     ValveServo,
     compute_joint_angles,
-    compute_poses,
-    find_columns,
+    compute_tip_poses,
+    environment_step_time,
+    find_observation_columns,
     find_position_columns,
-    step_time,
 )
 from hydrotele.envs.episode import MAX_ARM_AXES
 from hydrotele.envs.facts import (
@@ -50,7 +50,9 @@ class ReferencePreview:
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns and invert the interpolation matrix."""
         ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEW_TIMES]
-        self._columns = [find_columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)]
+        self._columns = [
+            find_observation_columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)
+        ]
         powers = np.arange(len(self._columns))
         rows = [[float(p == 0) for p in powers], [float(p == 1) for p in powers]]
         self._inverse = np.linalg.inv(np.array(rows + [[t**p for p in powers] for t in PREVIEW_TIMES]))
@@ -115,7 +117,7 @@ class RateFeedback:
                 [1/s].
         """
         self._tracking_gain, self._correction_gain = gains
-        self._fastest, self._dt = fastest, step_time(setup)
+        self._fastest, self._dt = fastest, environment_step_time(setup)
         self._period, self._ticks = setup.clock.period, setup.clock.ticks
         self._max_rate_change = accelerations * self._period
 
@@ -129,7 +131,7 @@ class RateFeedback:
         """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self._is_new |= mask
 
-    def compute_rates(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    def compute_rate_commands(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return the rate commands, scaled to +-1.
 
         Args:
@@ -168,7 +170,7 @@ class TrackByJointRates:
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         measured = observation[:, self._joint].astype(float)
-        return self._rate_feedback.compute_rates(measured, *self._preview.interpolate(observation, 0.0))
+        return self._rate_feedback.compute_rate_commands(measured, *self._preview.interpolate(observation, 0.0))
 
 
 class TrackByResolvedMotion:
@@ -184,25 +186,25 @@ class TrackByResolvedMotion:
         if k < len(setup.axes):
             raise InputError(f"task {setup.task.name}", "drives axes that are not part of the arm")
         self._preview, self._arm = ReferencePreview(setup), arm_specification(setup.machine)[0]
-        self._tip = find_columns(setup, "tip", COORDINATES[:k])
+        self._tip = find_observation_columns(setup, "tip", COORDINATES[:k])
         fastest = np.array(setup.task.pose_rates[:k])
         self._rate_feedback = RateFeedback(setup, fastest, np.array(MAX_POSE_ACCELERATIONS[:k]), _POSE_RATE_GAINS)
         self.begin, self.reset = self._rate_feedback.begin, self._rate_feedback.reset
 
-    def _pose(self, observation: np.ndarray, time: float) -> np.ndarray:
+    def _reference_tip_pose(self, observation: np.ndarray, time: float) -> np.ndarray:
         """Return the tip pose (n, k) that the joint references have `time` [s] from now."""
         q = self._preview.interpolate(observation, time)[0]
         pose = np.zeros((len(q), MAX_ARM_AXES))
-        compute_poses(self._arm, np.ascontiguousarray(q), pose)
+        compute_tip_poses(self._arm, np.ascontiguousarray(q), pose)
         return pose[:, : q.shape[1]]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
-        after = self._pose(observation, _DIFFERENCE_STEP)
-        before = self._pose(observation, -_DIFFERENCE_STEP)
+        after = self._reference_tip_pose(observation, _DIFFERENCE_STEP)
+        before = self._reference_tip_pose(observation, -_DIFFERENCE_STEP)
         measured = observation[:, self._tip].astype(float)
         rate = (after - before) / (2.0 * _DIFFERENCE_STEP)
-        return self._rate_feedback.compute_rates(measured, self._pose(observation, 0.0), rate)
+        return self._rate_feedback.compute_rate_commands(measured, self._reference_tip_pose(observation, 0.0), rate)
 
 
 def make_track_controller(setup: TaskSetup) -> Controller:
@@ -232,7 +234,7 @@ class TipController:
         self._kind = setup.options.action
         self._arm, _, self._ranges = arm_specification(setup.machine)
         self._joint = find_position_columns(setup)[:k]
-        self._tip = find_columns(setup, "tip", COORDINATES[:k])
+        self._tip = find_observation_columns(setup, "tip", COORDINATES[:k])
         self._fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes[:k]])
         self._fastest_pose = np.array(setup.task.pose_rates[:k])
         self._valves = ValveServo(setup, setup.task.servo, integral) if self._kind == "valve" else None
@@ -247,7 +249,7 @@ class TipController:
         if self._valves:
             self._valves.reset(mask)
 
-    def solve_joints(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def solve_joint_angles(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return the joint angles (n, k) for tip poses (n, k); for unreachable poses, the measured angles."""
         found = np.ascontiguousarray(observation[:, self._joint], float)
         whole = np.zeros((len(pose), MAX_ARM_AXES))
@@ -262,9 +264,10 @@ class LineController(TipController):
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
         super().__init__(setup)
-        self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
+        self._reference_columns = find_observation_columns(setup, "reference", COORDINATES[: self._k])
         self._preview_columns = [
-            find_columns(setup, f"reference_in_{time * 1000:.0f}_ms", COORDINATES[:3]) for time in LINE_PREVIEWS[:2]
+            find_observation_columns(setup, f"reference_in_{time * 1000:.0f}_ms", COORDINATES[:3])
+            for time in LINE_PREVIEWS[:2]
         ]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -276,7 +279,7 @@ class LineController(TipController):
             rate = (later[1] - later[0]) / (LINE_PREVIEWS[1] - LINE_PREVIEWS[0])
             off = wanted - seen[:, self._tip]
             return (rate + _LINE_GAIN * off) / self._fastest_pose
-        now, soon = self.solve_joints(observation, wanted), self.solve_joints(observation, later[0])
+        now, soon = self.solve_joint_angles(observation, wanted), self.solve_joint_angles(observation, later[0])
         rate = (soon - now) / LINE_PREVIEWS[0]
         if self._valves:
             return self._valves(observation, now, rate)
@@ -289,7 +292,7 @@ class ReachController(TipController):
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
         super().__init__(setup, _TIP_INTEGRAL)
-        self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
+        self._reference_columns = find_observation_columns(setup, "reference", COORDINATES[: self._k])
         servo = setup.task.servo
         gains = [servo.axis_gains.get(axis, servo.position_gain) for axis in setup.axes[: self._k]]
         self._position_gains = np.array(gains)
@@ -303,7 +306,7 @@ class ReachController(TipController):
             return np.array(_REACH_GAINS) * off / self._fastest_pose
         joint = seen[:, self._joint]
         most = _REACH_RATE_FRACTION * self._fastest
-        rate = np.array(_JOINT_GAINS) * (self.solve_joints(observation, wanted) - joint)
+        rate = np.array(_JOINT_GAINS) * (self.solve_joint_angles(observation, wanted) - joint)
         rate = np.clip(rate, -most, most)
         if self._valves:
             return self._valves(observation, joint + rate / self._position_gains, np.zeros_like(rate))
@@ -339,8 +342,8 @@ class PressController:
         """
         if setup.options.action != "resolved_motion":
             raise InputError(f"action {setup.options.action!r}", "must be resolved_motion")
-        self._force_column = find_columns(setup, "force", [""])[0]
-        self._reference_column = find_columns(setup, "reference_force", [""])[0]
+        self._force_column = find_observation_columns(setup, "force", [""])[0]
+        self._reference_column = find_observation_columns(setup, "reference_force", [""])[0]
         self._fastest, self._actions = setup.task.pose_rates[2], len(setup.axes)
 
     def begin(self, count: int) -> None:

@@ -33,7 +33,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import get_sensors, noise_rms
+from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
 from tools.validation.blind.score import share
 from tools.validation.blind.spreads import SIZES
@@ -105,8 +105,8 @@ def make_problem(folder: Path, facts: Facts, limit: float) -> Problem:
         The problem.
     """
     logs = [load_log(folder / f"{name}.parquet") for name in ("fit_1", "fit_2", "fit_3", "test_1")]
-    sensors, names = get_sensors(facts, SENSORS[facts.name]), channels(facts)
-    size = np.array([noise_rms(facts, sensors, name) for name in names])
+    sensors, names = get_sensor_set(facts, SENSORS[facts.name]), channels(facts)
+    size = np.array([reading_noise_rms(facts, sensors, name) for name in names])
     commands = [np.column_stack([log[f"command.{a}"] for a in facts.axes]) for log in logs]
     readings = [np.column_stack([log[name] for name in names]) for log in logs]
     period = float(logs[0].time[1] - logs[0].time[0])
@@ -190,9 +190,9 @@ def floor(problem: Problem, rng: np.random.Generator) -> float:
 
 
 def _units(names: list[str]) -> dict[str, str]:
-    from hydrotele.machine.signals import default_unit
+    from hydrotele.machine.signals import default_channel_unit
 
-    return {name: default_unit(name, names) for name in names}
+    return {name: default_channel_unit(name, names) for name in names}
 
 
 class Number(NamedTuple):

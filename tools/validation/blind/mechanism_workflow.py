@@ -11,7 +11,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-from hydrotele.cli.gapping import simulate_open_loop
+from hydrotele.cli.gapping import compute_open_loop_errors
 from hydrotele.core.errors import InputError
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.result import gap_document
@@ -30,7 +30,7 @@ def main() -> None:
         try:
             fit, judge, said = load_mechanism_records([folder], mechanism, keep_measured_joints=True)
             gap = find_mechanism_gap(asked.mjcf, asked.columns, fit, judge, notes=said)
-            loop = simulate_open_loop(gap, [folder], mechanism, None)
+            loop = compute_open_loop_errors(gap, [folder], mechanism, None)
             document = gap_document(dataclasses.replace(gap, open_loop=loop))
         except InputError as error:
             document = {"error": str(error)}

@@ -119,7 +119,7 @@ def _demand(machine: Machine, path: dict[str, np.ndarray], time) -> np.ndarray:
     """Oil that the motion takes from the pump (n,) [m^3/s]."""
     total = np.zeros(len(time))
     for axis in actuator_order(machine):
-        head, rod = machine.axes[axis].hydraulic_drive.areas
+        head, rod = machine.axes[axis].hydraulic_drive.effective_areas
         speed = axis_linkage(machine, axis).rate(path[axis]) * np.gradient(path[axis], time)
         total += np.where(speed > 0.0, head, rod) * np.abs(speed)
     return total

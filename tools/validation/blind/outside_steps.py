@@ -8,8 +8,8 @@ change the actuators' numbers, activations or applied forces, and no code of the
 import math
 
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
-from hydrotele.hydraulics.laws import axis_opening, orifice_flow
-from hydrotele.simulate.record import state_supply
+from hydrotele.hydraulics.laws import axis_valve_opening, orifice_flow
+from hydrotele.simulate.record import state_supply_pressure
 
 _WARM_UP = 40.0  # s
 _REGULATOR = 0.05  # s, of a pump's torque control
@@ -92,7 +92,7 @@ def power_limit(model, i, machine, location, p):
     part = model.opt.timestep / _REGULATOR
 
     def step(data):
-        supply = state_supply(flat, count, data.act, scratch)
+        supply = state_supply_pressure(flat, count, data.act, scratch)
         wanted = min(base, p["power"] / max(supply, 1e6))
         user[:, Slot.PUMP_FLOW] += part * (wanted - user[0, Slot.PUMP_FLOW])
 
@@ -147,7 +147,7 @@ class _Chambers:
     def returning(self, data) -> tuple[int, float]:
         """Side that drains to tank (0 head, 1 rod) and its flow out [m^3/s]."""
         user = self.user
-        opening = axis_opening(user, 0, data.act[4 * self.i])
+        opening = axis_valve_opening(user, 0, data.act[4 * self.i])
         side = 1 if opening > 0.0 else 0
         edge = user[Slot.METERING_BT if opening > 0.0 else Slot.METERING_AT]
         drop = data.act[4 * self.i + 2 + side] - user[Slot.TANK_PRESSURE]

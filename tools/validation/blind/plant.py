@@ -11,11 +11,11 @@ from scipy.signal import lsim, lti
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensors
+from hydrotele.machine.machine import Machine, SensorError, get_sensor_set
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
 from hydrotele.simulate.feedback import simulate_readings
-from hydrotele.simulate.record import state_supply
+from hydrotele.simulate.record import state_supply_pressure
 from tools.validation.blind.draw import Planted
 from tools.validation.blind.outside import OUTSIDE
 
@@ -60,7 +60,7 @@ def record(machine: Machine, scenario: Scenario, planted: list[Planted]) -> Reco
     changed = _misread(run.truth.time, channels, beyond)
     columns = dict(run.measured.columns)
     redone = {c: v for c, v in changed.items() if v is not run.truth[c]}
-    columns |= simulate_readings(machine, get_sensors(machine, scenario.sensors), scenario.seed, redone)
+    columns |= simulate_readings(machine, get_sensor_set(machine, scenario.sensors), scenario.seed, redone)
     readings = {c: _read(run, c, v) for c, v in changed.items() if not c.startswith("command.")}
     metadata = {k: v for k, v in run.measured.metadata.items() if k in _KEPT}
     log = dataclasses.replace(run.measured, columns=columns, metadata=metadata)
@@ -113,7 +113,7 @@ def _supply(machine: Machine, truth: Log, numbers: dict[int, np.ndarray]) -> np.
     kinds = ("truth.spool", "truth.spool_rate", "pressure_head", "pressure_rod")
     act = np.column_stack([truth[f"{kind}.{axis}"] for axis in order for kind in kinds])
     return np.array([
-        state_supply(numbers[row], len(order), np.ascontiguousarray(act[row]), scratch)
+        state_supply_pressure(numbers[row], len(order), np.ascontiguousarray(act[row]), scratch)
         for row in range(len(act))
     ])  # fmt: skip
 

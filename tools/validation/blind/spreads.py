@@ -41,7 +41,7 @@ def either(rng: Rng, low: float, high: float) -> float:
 def _force(machine: Machine, place: str) -> float:
     """Force at relief pressure over the piston [N] or [N m]."""
     assert machine.supply
-    return machine.supply.relief_pressure * machine.axes[place].hydraulic_drive.areas[0]
+    return machine.supply.relief_pressure * machine.axes[place].hydraulic_drive.effective_areas[0]
 
 
 def _rub(machine: Machine, place: str):
@@ -53,7 +53,7 @@ def _oil(machine: Machine, place: str) -> float:
     drive, cylinder = machine.axes[place].hydraulic_drive, machine.axes[place].cylinder
     stroke = cylinder.stroke if cylinder else 0.0
     assert machine.supply
-    return (drive.dead_volume + 0.5 * drive.areas[0] * stroke) / machine.supply.bulk_modulus
+    return (drive.dead_volume + 0.5 * drive.effective_areas[0] * stroke) / machine.supply.bulk_modulus
 
 
 def _deadband(machine: Machine, place: str, rng: Rng) -> Values:

@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
-from hydrotele.simulate.mechanism import flexible_axes
+from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
 from hydrotele.simulate.record import Recorder, start_leapfrog, true_channels
 from hydrotele.simulate.stepping import delayed_commands
@@ -50,7 +50,7 @@ def visibility(model: Machine, runs: dict[str, Recorded]) -> dict[str, Any]:
 
 def _differences(plant: Plant, run: Recorded) -> dict[str, np.ndarray]:
     machine = plant.machine
-    sensors = get_sensors(machine, run.log.metadata["sensors"])
+    sensors = get_sensor_set(machine, run.log.metadata["sensors"])
     predicted = _restarted(plant, run.truth, np.column_stack(
         [run.log[f"command.{axis}"] for axis in plant.axes]
     ))  # fmt: skip
@@ -58,7 +58,7 @@ def _differences(plant: Plant, run: Recorded) -> dict[str, np.ndarray]:
     for channel, reading in run.readings.items():
         error = machine.sensor_errors.get(channel, SensorError())
         expected = shown(error, run.truth.time, predicted[channel])
-        difference = (reading - expected) / noise_rms(machine, sensors, channel)
+        difference = (reading - expected) / reading_noise_rms(machine, sensors, channel)
         if _free_zero(machine, channel):
             difference = difference - difference.mean()
         table[channel] = difference
@@ -105,7 +105,7 @@ def _state(plant: Plant, truth: Log, row: int) -> dict[str, Any]:
         state[key] = [truth[f"truth.{key}.{a}"][row] for a in valves]
     for key in ("pressure_head", "pressure_rod"):
         state[key] = [truth[f"{key}.{a}"][row] for a in valves]
-    sides = {a: _drive_side(plant.machine, truth, a, row) for a in flexible_axes(plant.machine)}
+    sides = {a: _drive_side(plant.machine, truth, a, row) for a in axes_with_transmission(plant.machine)}
     state["drive"] = {a: place for a, (place, _) in sides.items()}
     state["drive_velocity"] = {a: speed for a, (_, speed) in sides.items()}
     return state

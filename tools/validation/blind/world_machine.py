@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import SensorError, SensorSet, channel_converter, channel_sensor
+from hydrotele.machine.machine import SensorError, SensorSet, find_channel_sensor, make_channel_converter
 from tools.validation.blind.world import Added, Drives, Forms, Machine, Mechanism, Sensors
 
 
@@ -58,8 +58,8 @@ def channels(facts: Facts) -> list[str]:
 def stated_errors(facts: Facts, sensors: SensorSet) -> tuple[np.ndarray, np.ndarray]:
     """Bound of the uniform error and converter step of every channel, (c,) each."""
     names = channels(facts)
-    kinds = [channel_sensor(facts, sensors, name) for name in names]
-    steps = [channel_converter(s, name).step for s, name in zip(kinds, names, strict=True)]
+    kinds = [find_channel_sensor(facts, sensors, name) for name in names]
+    steps = [make_channel_converter(s, name).step for s, name in zip(kinds, names, strict=True)]
     return np.array([s.accuracy for s in kinds]), np.array(steps)
 
 
@@ -129,8 +129,8 @@ def _drives(facts: Facts) -> Drives:
 
     return Drives(
         cylinder=np.array([a.cylinder is not None for a in axes]),
-        area_head=np.array([d.areas[0] for d in drives]),
-        area_rod=np.array([d.areas[1] for d in drives]),
+        area_head=np.array([d.effective_areas[0] for d in drives]),
+        area_rod=np.array([d.effective_areas[1] for d in drives]),
         dead_volume=of(drives, "dead_volume"),
         stroke=np.array([a.cylinder.stroke if a.cylinder else 0.0 for a in axes]),
         leakage=of(drives, "leakage"),
@@ -179,7 +179,7 @@ def _with_transmissions(facts: Facts, forms: Forms) -> Forms:
 def _sensors(facts: Facts, sensors: SensorSet) -> Sensors:
     names = channels(facts)
     errors = [facts.sensor_errors.get(name, SensorError()) for name in names]
-    converters = [channel_converter(channel_sensor(facts, sensors, name), name) for name in names]
+    converters = [make_channel_converter(find_channel_sensor(facts, sensors, name), name) for name in names]
     return Sensors(
         scale=np.array([e.scale for e in errors]),
         offset=np.array([e.offset for e in errors]),

@@ -9,7 +9,7 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
 from hydrotele.machine import signals
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import get_sensors, noise_rms
+from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from tools.validation.blind.motions import RATE, motions
 from tools.validation.blind.world import (
     PA,
@@ -101,7 +101,7 @@ class WorldRun:
 
 
 def _sensors(facts: Facts):
-    found = get_sensors(facts, SENSORS[facts.name])
+    found = get_sensor_set(facts, SENSORS[facts.name])
     assert found
     return found
 
@@ -248,7 +248,7 @@ def _log(model: Facts, reference: Reference, commands, readings) -> Log:
     return Log(
         time=reference.period * np.arange(len(commands)),
         columns=dict(zip(names, values, strict=True)),
-        units={name: signals.default_unit(name, names) for name in names},
+        units={name: signals.default_channel_unit(name, names) for name in names},
         metadata=metadata,
     )
 
@@ -286,7 +286,7 @@ def visibility(without: Machine, model: Facts, runs: list[WorldRun]) -> float:
         [standard deviations of one reading].
     """
     names, sensors, total = channels(model), _sensors(model), 0.0
-    size = np.array([noise_rms(model, sensors, name) for name in names])
+    size = np.array([reading_noise_rms(model, sensors, name) for name in names])
     for run in runs:
         if not run.name.startswith("fit"):
             continue
