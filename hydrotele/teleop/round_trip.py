@@ -79,16 +79,20 @@ def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
 
     Returns:
         (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Before the first
-        arrival it is the longest delay.
+        arrival it is the longest delay, as if packets had been sent before the first period.
 
     >>> compute_arriving_ages(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
+    >>> compute_arriving_ages(np.array([-1, -1, -1, 1, 1])).tolist()  # the packet of period 1 is lost
+    [1, -1, -1, -1, 1]
     """
     delays = np.asarray(delays)
     ages, ticks = compute_packet_ages(delays), np.arange(len(delays))
     newest = ticks - ages
     fresh = np.diff(newest, prepend=-1) > 0
-    return np.where(newest < 0, max(int(delays.max()), 0), np.where(fresh, ages, -1))
+    longest = max(int(delays.max()), 0)
+    before_start = (newest < 0) & (ticks < longest)
+    return np.where(before_start, longest, np.where((newest >= 0) & fresh, ages, -1))
 
 
 def delays_to_periods(delays: np.ndarray, period: float) -> np.ndarray:

@@ -445,7 +445,15 @@ def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
     return rate * max(0.0, s.time - start)
 
 
-@law
+def _check_divisors(given: Parameters) -> None:
+    """Raise ValueError for a time constant, width or smoothing range that is not positive; laws divide by them."""
+    for name in ("time_constant", "width", "smoothing_velocity", "smoothing"):
+        value = given.get(name, 1.0)
+        if isinstance(value, (int, float)) and not value > 0.0:
+            raise ValueError(f"{name} must be positive, not {value!r}")
+
+
+@law(check=_check_divisors)
 def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
     """Return a drift from 0 to `value`, `value (1 - exp(-t / time_constant))`, with t the time [s]."""
     return value * (1.0 - math.exp(-s.time / time_constant))
@@ -592,7 +600,7 @@ def quadratic_drag(s: DriveState, coefficient: float) -> float:
     return -coefficient * s.velocity * abs(s.velocity)
 
 
-@law
+@law(check=_check_divisors)
 def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) -> float:
     """Return dry friction of seals and guides that is proportional to the drive's load.
 
@@ -604,7 +612,7 @@ def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) 
     return -coefficient * abs(s.force) * math.tanh(s.velocity / smoothing_velocity)
 
 
-@law
+@law(check=_check_divisors)
 def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float) -> float:
     """Return dry friction around one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`.
 
@@ -615,7 +623,7 @@ def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, sm
     return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
 
 
-@law
+@law(check=_check_divisors)
 def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
     """Return the turbulent leakage from the head-side into the rod-side chamber [m^3/s].
 
@@ -629,7 +637,7 @@ def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
     return flow_gain * drop / math.sqrt(math.sqrt(drop * drop + smoothing * smoothing))
 
 
-@law
+@law(check=_check_divisors)
 def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: float) -> float:
     """Return the change of viscous friction while the oil's viscosity drifts, `-b (m(t) - 1) v`.
 
@@ -641,7 +649,7 @@ def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: fl
     return -viscous * change * s.velocity
 
 
-@law
+@law(check=_check_divisors)
 def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: float) -> float:
     """Return the change of laminar leakage while the oil's viscosity drifts [m^3/s].
 
