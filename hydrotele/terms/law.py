@@ -221,6 +221,8 @@ def law(
 ) -> Any:  # fmt: skip
     """Register a function as a law under its name; decorator.
 
+    A law adds a force, a flow or a command to a drive of a machine, as a function of its state.
+
     Args:
         function: `(state, *parameters) -> float`, with annotations as in the module docstring.
         check: function that raises ValueError for invalid parameters.
@@ -413,13 +415,16 @@ def _make_formula_error(text: str, why: str) -> ValueError:
 
 @law
 def constant(s: DriveState, value: float) -> float:
-    """Return a constant contribution to the balance, `value` in the unit of the balance."""
+    """Return a constant additional force, flow or command of a drive.
+
+    `value` has the unit of what it is added to: [N], [N m], [m^3/s], [1] or [V].
+    """
     return value
 
 
 @law
 def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
-    """Return a pulse over time: `size` from `start` [s] for a `duration` [s], otherwise 0.
+    """Return a pulse of force, flow or command: `size` from `start` [s] for a `duration` [s], else 0.
 
     The edges are half cosine waves, centred on start and end; their length is the fraction `edge`
     of the duration. The pulse is thus differentiable with respect to every parameter.
@@ -441,7 +446,7 @@ def pulse(s: DriveState, size: float, start: float, duration: float, edge: float
 
 @law
 def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
-    """Return a ramp over time: 0 until `start` [s], then growing by `rate` per second."""
+    """Return an additional force, flow or command: 0 until `start` [s], then growing by `rate` per s."""
     return rate * max(0.0, s.time - start)
 
 
@@ -455,7 +460,10 @@ def _check_divisors(given: Parameters) -> None:
 
 @law(check=_check_divisors)
 def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
-    """Return a drift from 0 to `value`, `value (1 - exp(-t / time_constant))`, with t the time [s]."""
+    """Return an additional force, flow or command that drifts exponentially from 0 to `value`.
+
+    It is `value (1 - exp(-t / time_constant))`, with t the time [s].
+    """
     return value * (1.0 - math.exp(-s.time / time_constant))
 
 
@@ -486,9 +494,9 @@ def _check_bilinear_table(given: Parameters) -> None:
 
 @law(check=_check_table)
 def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers) -> float:
-    """Interpolate a table linearly in one state variable.
+    """Interpolate an additional force, flow or command linearly in one state variable of a drive.
 
-    `points` [unit of the variable] increase; `values` are the contributions to the balance at these
+    `points` [unit of the variable] increase, and `values` are the forces, flows or commands at these
     points. Beyond the first and the last point the value is constant.
 
     >>> import numpy as np
@@ -517,7 +525,9 @@ def bilinear_table(
     s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
     column_points: Numbers, values: Numbers,
 ) -> float:  # fmt: skip
-    """Interpolate a table bilinearly in two state variables; constant beyond the outer points.
+    """Interpolate an additional force, flow or command bilinearly in two state variables of a drive.
+
+    The value is constant beyond the outer points.
 
     `values` has one row for each of the `row_points`, and one column for each of the
     `column_points`; the compiled law receives it row by row.
