@@ -52,7 +52,7 @@ _PUBLISHED_FORCE_ERRORS = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
 
 
 def read_machine_dimensions(seed: int, changes: Changes) -> Sample:
-    """Read masses and dimensions from the machine model.
+    """Read masses and dimensions from the machine model of Khoshzaban's excavator.
 
     Args:
         seed: not used.
@@ -214,20 +214,22 @@ def evaluate_force_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the torque and force errors due to pressure errors of 25 psi with Khoshzaban 1992, Eq. 4.61."""
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
-                    "5747 N is printed as 5700", "N m" if name == "swing" else "N")
+                    "within 60 of the printed value, which is rounded to hundreds (5747 N is printed as"
+                    " 5700 N)", "N m" if name == "swing" else "N")
         for name, published in _PUBLISHED_FORCE_ERRORS.items()
     ))  # fmt: skip
 
 
 def find_identifiable_parameters(seed: int, changes: Changes) -> Sample:
-    """Find which parameters are identifiable in each calibration stage, and compare them with the thesis.
+    """Find which parameters are identifiable in each calibration stage, and compare them with those published.
 
     Args:
         seed: not used.
         changes: `wander`: rotation of the grapple during a stage [deg].
 
     Returns:
-        `different.LINK`: number of parameters that are in only one of the found and the published list.
+        `different.LINK`: number of parameters that are in only one of two lists, the found one and
+        that of Khoshzaban 1992, section 3.6.4.
     """
     chosen = merge_settings({"wander": None}, changes)
     loop = build_loop(load_machine("calibrator"))
@@ -263,7 +265,8 @@ def measure_held_link_drift(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: not used.
-        changes: scenario keys, or parameters of Table 2's chain such as `a.boom` [m].
+        changes: scenario keys, or parameters, such as `a.boom` [m], of the chain of Khoshzaban
+            1992, Table 2, whose closure is checked.
 
     Returns:
         Largest drift of each held link [deg] and largest closure error `gap` of the chain [m].

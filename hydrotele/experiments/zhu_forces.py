@@ -229,6 +229,8 @@ _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 def search_max_feedback_ratio(number: int, changes: Changes) -> Sample:
     """Search for the largest stable ratio of hand force to contact force in direct feedback, to 20 %.
 
+    Direct feedback reflects the contact force, scaled, to the hand.
+
     Args:
         number: number of the condition in `FEEDBACK_CONDITIONS`, from 1 on.
         changes: scenario keys.
@@ -253,7 +255,10 @@ def search_max_feedback_ratio(number: int, changes: Changes) -> Sample:
 
 
 def _is_direct_feedback_stable(ratio: float, keys: Changes) -> bool:
-    """Return whether direct feedback keeps the handle within twice its dead band in the last 40 % of a run."""
+    """Return whether direct force feedback with this ratio keeps the handle near its centre.
+
+    It must stay within twice its dead band of 1.5 mm in the last 40 % of a run.
+    """
     values = measure_direct_feedback(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
@@ -323,7 +328,7 @@ def measure_tracking(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who tracks a force trajectory on a rock and sees the contact force on a screen.
 
     The four conditions are with and without force reflection, each with and without the detents of
-    Table 6.11.
+    Zhu 1994, Table 6.11.
 
     Args:
         seed: seed of operator and sensor noise.
@@ -424,7 +429,8 @@ STIFFNESS_FEEDBACK = (
             "document",
             _evaluate_feedback_limits,
             {"pilot.reflection": "stiffness"},
-            "stiffness feedback, which has no such limit",
+            "stiffness feedback, for which the ratio has no influence: the handle stays within twice its"
+            " dead band at all ratios or, pushed by the operator, at none",
         ),
     ), fixed_repetitions=len(FEEDBACK_CONDITIONS)),
 )  # fmt: skip

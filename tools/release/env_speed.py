@@ -39,8 +39,9 @@ def main() -> None:
 def _ways(name: str, asked) -> list[str]:
     lines = [
         f"A batch has {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
-        "Larger is better. `Physics alone` is `mujoco.batch.Batch` with two threads on the same",
-        "model and commands, without control, sensors and reward.",
+        "Larger is better. `Physics alone` is MuJoCo's `mujoco.batch.Batch` with two threads on the same",
+        "model and commands, without control, sensors and reward. The batched environments have their own",
+        "loop over `mj_step` and may be faster than `Batch`.",
         "",
         "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
         "| Async | physics alone | batched / Sync | batched / Async | physics alone / Sync |",

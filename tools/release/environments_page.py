@@ -11,7 +11,7 @@ from hydrotele.envs.task import Options, Task
 from tools.studies.study import options, publish
 
 COMMON = """\
-Every environment is `gymnasium.make("hydrotele/NAME-v0", **options)` after `import
+The command above writes this page. Every environment is `gymnasium.make("hydrotele/NAME-v0", **options)` after `import
 hydrotele.envs`, batched with `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")`,
 and for dm_control `hydrotele.envs.dm.load("NAME", **options)`.
 
@@ -24,7 +24,7 @@ commands the valves; `"joint_rate"` asks for rates of the axes, `"resolved_motio
 the tip (r, theta, z, attitude, head), both followed by the joint servo at 200 Hz with bounded
 acceleration.
 
-**Episode**: `truncated` when its duration is over; `terminated` where the task says so, or if the
+**Episode**: `truncated` when its duration is over; `terminated` at an end condition of the task, or if the
 simulation became unstable (`info["fault"]`, never seen in ten million random steps). A step of a
 single environment after the end is an error: call `reset` first.
 `reset(seed=...)` gives the same bits again, alone, batched, on any number of threads; a batch's
@@ -35,6 +35,15 @@ environment i has the seed of the first one plus i.
 
 **Options** of all:
 """
+
+NOTES = {
+    "HoldForce": """\
+`force` is the reading of a load cell under the plate: the force in its spring and damper, positive if
+the plate is pressed down. The reward uses the true force.""",
+    "Grade": """\
+`soil` is 0 for soft, 1 for loamy, 2 for firm soil. `profile_error.0` to `.19` are the mean heights
+of the ground above the plane in 20 equal sections from r = 3.8 to 5.8 m; negative: too low.""",
+}
 
 
 def main() -> None:
@@ -72,6 +81,7 @@ def _section(task: Task) -> str:
         f' `action="{setup.options.action}"` by default.',
         f"Info: {', '.join(f'`{name}` [{unit}]' for name, unit in task.measures)}.",
         "",
+        *((NOTES[task.name], "") if task.name in NOTES else ()),
         f"Actions: {'; '.join(_actions(setup, kind) for kind in ACTIONS)}.",
         "",
         "| observation | unit | from | to |",

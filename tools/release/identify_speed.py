@@ -112,7 +112,8 @@ def main() -> None:
     log = run_scenario(load_scenario("excitation", {"duration": str(60 * asked.minutes)})).measured
     lines = [
         "Time and memory of `hydrotele identify` for growing length of a CAT 215 log at 50 Hz, one"
-        " process per log. Smaller is better.", "",
+        " process per log. Smaller is better. Each time is from a single run, so that rows can be compared only"
+        " roughly.", "",
         "| log [min] | identification [s] | whole process [s] | peak memory [MB] |",
         "| ---: | ---: | ---: | ---: |",
     ]  # fmt: skip

@@ -54,7 +54,11 @@ def noise(seeds: int) -> str:
     lines = [
         f"{seeds} seeds of uniform sensor noise within 0.1 deg, {sum(len(c.theta) for c in clean)}"
         " poses, a machine that differs from nominal by N(0, 30 mm) and N(0, 1 deg)."
-        " Bias with its standard error and standard deviation in mm and mdeg; smaller is better.",
+        " Bias with its standard error and standard deviation in mm and mdeg; smaller is better."
+        " Parameters of the stage in which `pitch`, ... moves: p_xy, p_z: distance of the ball from the moving axis"
+        " and its height along it; alpha, a, d, beta: Denavit-Hartenberg parameters, with Hayati's angle beta;"
+        " held: constant angle of a held joint; offset: zero of an angle sensor (`calibrator_yoke`,"
+        " `calibrator_twist`: joints 6 and 7, of the calibrator).",
         "",
         "| parameter | bias, hierarchical | std | coverage 95 % | bias, joint | std |"
         " coverage 95 % | RMS joint / hierarchical |",

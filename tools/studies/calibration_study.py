@@ -113,7 +113,12 @@ def mukca(asked: argparse.Namespace) -> str:
             f" {1e3 * error[:, k].std(ddof=1):.3f} | {1e3 * stated:.3f} |"
             f" {100 * inside[:, k].mean():.1f} |"
         )
-    lines += ["", "Bias and standard deviations in mm and mrad.", ""]
+    lines += [
+        "",
+        "Bias and standard deviations in mm and mrad. Bias, standard deviations and coverage are over all"
+        f" {many} data sets, also those in which the parameter is identifiable only in a combination.",
+        "",
+    ]
     return "\n".join(lines)
 
 

@@ -63,9 +63,9 @@ LIMITS = (
     "- A faster estimate has a larger false force. On `zhu_up` the dynamic estimate is worse "
     "than the static one at 3 and 6 Hz and above.",
     "- A disturbance observer had 10 N with ideal sensors, but 240 and 440 N on `zhu_up` and "
-    "`zhu_out` with real ones at 1 Hz (earlier version). Pressure noise of 25 psi moves the "
-    "light bucket faster than the velocity at which friction changes sign. At rest, the model's "
-    "own friction hides a force. Kalman gains gave 260 to 400 N.",
+    "`zhu_out` with real ones at 1 Hz (earlier version). In its model, pressure noise of "
+    "25 psi moves the light bucket faster than the velocities over which friction changes sign. At "
+    "rest, the model's own friction hides a force. Kalman gains gave 260 to 400 N.",
     "- A friction model of creep, visible only after longer averaging, gave no improvement.",
     "",
 )
@@ -267,7 +267,10 @@ def parameters(results: list[dict]) -> list[str]:
     return [
         "## Static model", "",
         "Parameters of `tau = Y(q) P` from `scenarios/slow_moves.yaml` with the machine's "
-        "sensors, by recursive least squares. Identified: with a Coulomb friction of every drive "
+        "sensors, by recursive least squares. C2, S2, C23, ... are the factors of the cosine and sine "
+        "of the sums of the joint angles 2 (boom), 3 (stick) and 4 (bucket). Links alone, all masses: "
+        "computed from the masses of the links, without and with those of tubes and rods. Identified: "
+        "with a Coulomb friction of every drive "
         "as a further parameter. Friction ignored: with friction left in the torques, as in "
         "Zhu's work.",
         "", *lines, "",
@@ -306,7 +309,7 @@ def bands(results: list[dict]) -> list[str]:
     """Table of false forces over the bandwidth of the filters."""
     lines = [
         "## Bandwidth", "",
-        "False force with the machine's sensors and other filters (slow, fast).",
+        "False force with the machine's sensors and other bandwidths of the slow and the fast filter.",
         "",
         "| slow, fast [Hz] | delay [s] | zhu_up: static, dynamic [N] |"
         " excitation: static, dynamic [N] |",
@@ -328,7 +331,7 @@ def ways(results: list[dict]) -> list[str]:
         "## Alternative estimators", "",
         "False force of the dynamic estimate with the machine's sensors [N], all with the same "
         "delay: one filter for all signals; a generalised-momentum observer; the two filters. "
-        "With one filter, friction belongs to a delayed rate and the forces to another time.",
+        "With one slow filter, the friction of the filtered rate differs from the filtered friction.",
         "",
         "| motion | one filter | momentum observer | two filters |",
         "| --- | ---: | ---: | ---: |",
@@ -392,7 +395,9 @@ def report(results: list[dict]) -> str:
         "model, and compared with the force in the simulation. Such an estimate needs no force "
         "sensor. Errors: lower is better.",
         "",
-        f"Filters of {FORCE_BANDWIDTH_HZ:g} and {MOTION_BANDWIDTH_HZ:g} Hz unless stated otherwise, with a delay of "
+        "A fast filter gives positions, rates, accelerations and pressures with equal delay; the force that follows "
+        f"from them passes a slow filter. Slow {FORCE_BANDWIDTH_HZ:g} Hz and fast {MOTION_BANDWIDTH_HZ:g} Hz unless "
+        "stated otherwise, with a delay of "
         f"{filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ):.2f} s. One update takes "
         f"{took[0]:.0f} us (static) and {took[1]:.0f} us (dynamic).",
         "",

@@ -28,7 +28,8 @@ terminations: [environments](../environments.md).
 All controllers run the same episodes (same seeds and machines). Cells are mean ±
 standard error over the episodes. A larger return, `success` and `contact` are better; a smaller
 error (RMS) is better. `final` is the fraction of episodes in which the condition holds at the end;
-`overload`, `off_plate` (the tip is no longer over the plate) and `spoiled` are failures.
+`overload`, `off_plate` (the tip is no longer over the plate) and `spoiled` are failures. `soil` is the index of
+the soil (0 soft, 1 loamy, 2 firm); it shows which soils the episodes had.
 
 The `reference` controller uses the nominal machine and the observation. Randomised machines have
 the effects of `hydrotele.envs.variants.typical_variation`: valve overlap, flow and bandwidth,

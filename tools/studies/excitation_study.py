@@ -96,8 +96,11 @@ def main() -> None:
     ratios = {name: stds[0][name] / stds[1][name] for name in both}
     text = "\n".join([
         f"A designed motion is compared with the scenario `{OLD}`, a Fourier motion as in"
-        " Khoshzaban 1992. Both are simulated for 60 s with the sensors of the CAT 215. Design:"
-        f" {len(base)} base parameters, {asked.harmonics} harmonics, {asked.starts} starts. A"
+        " Khoshzaban 1992. Both are simulated for 60 s with the sensors of the CAT 215. The design"
+        f" maximises the information on {len(base)} base parameters, those that a random motion determines"
+        f" despite the sensor noise; {asked.harmonics} harmonics, {asked.starts} starts. The designed motion"
+        " determines further ones. The number of base parameters without noise is larger"
+        " ([identifiability](identifiability.md)). A"
         " smaller standard deviation is better; a ratio above 1 favours the designed motion.", "",
         "| | |", "| --- | ---: |",
         f"| ratio of the determinant criterion per parameter, designed to `{OLD}` | {better:.1f} |",
@@ -107,6 +110,8 @@ def main() -> None:
         f" {len(stds[0])} / {len(stds[1])} |",
         f"| interval width, `{OLD}` to designed motion, median ratio | "
         f"{np.median(list(ratios.values())):.2f} |", "",
+        "Parameters are in SI units; `boom_rod` and `stick_rod` are the boom and stick cylinders, `offset` is a"
+        " constant force of a drive.", "",
         "| parameter | std, `excitation` | std, designed | ratio |",
         "| --- | ---: | ---: | ---: |",
         *(f"| {n} | {stds[0][n]:.3g} | {stds[1][n]:.3g} | {r:.2f} |" for n, r in ratios.items()),

@@ -132,7 +132,7 @@ def over(simulated: float, predicted: float) -> str:
 
 def limits_table(bare: list, shipped: list) -> list[str]:
     lines = [
-        "| setting | predicted | swing [Hz] | simulated, no dead bands | over predicted |"
+        "| setting | predicted | frequency [Hz] | simulated, no dead bands | over predicted |"
         " predicted with dead band | simulated as shipped | over predicted with dead band |",
         "| --- |" + " ---: |" * 7,
     ]
@@ -222,7 +222,8 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         "", "![Limits and contact forces](force_reflection.png)",
         "", "## Direct force under rate control: predicted and simulated limit", "",
         *limits_table(bare, shipped), "",
-        "Predicted: `hydrotele analyse teleop`, from the same parameters as the simulation. No "
+        "Predicted: `hydrotele analyse teleop`, from the same parameters as the simulation, with "
+        "the frequency of the oscillation at the limit. No "
         "dead bands: those of joystick and valves are zero, with ideal sensors and the same "
         "speed per displacement. This is the case that a linear loop describes. Simulated over "
         f"predicted (1 is best): {min(factor):.2f} to {max(factor):.2f}, median "
@@ -233,13 +234,14 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         f"ratios are a ladder with steps of 1.25 from {LADDER[0]:g} to {LADDER[-1]:.0f} times the "
         "linear prediction.",
         "", "## Stiffness feedback with the same reflection", "",
-        f"Direct force has the ratio {small(sides[0][2])}, which stiffness feedback reflects at "
-        "the edge of the dead band. Both have the dead band and real sensors. Swing: lower is "
+        f"Direct force has the ratio {small(sides[0][2])}. With it, both structures give the same "
+        "force in the hand at the edge of the dead band. Both have the dead band and real sensors. Swing: lower is "
         "better.",
         "", *sides_table(sides, asked.seeds), "",
         "## Stiffness feedback with delay", "",
-        "The published gains do not meet the sufficient condition of the theorem. They are "
-        "stable by the [bound on the worst switching](stability.md), with which every change of "
+        "The published gains do not meet the sufficient condition B² > 4 M K_max of Zhu's theorem 4-2 "
+        "(mass M, damping B, largest stiffness K_max of joystick and hand). They are stable by the "
+        "[bound on the worst switching](stability.md) between the stiffnesses, with which every change of "
         "stiffness decays. The handle swings because the operator corrects the force by short "
         "pushes.",
         "", *delays_table(cases, late, asked.seeds), "",

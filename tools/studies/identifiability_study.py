@@ -54,7 +54,12 @@ TEXT = """\
 - The regressor with pins agrees with the inverse dynamics of MuJoCo to 1e-8. For both assumptions
   it agrees with the recursion of the thesis (Eqs 4.20 to 4.47), derived independently in
   `tests/experiments/test_khoshzaban_dynamics.py`.
-- The null space does not depend on the random states."""
+- The null space does not depend on the random states.
+- Coulomb friction: `boom_rod`, `stick_rod` in the cylinders; `boom`, `stick` in the joints of the
+  links; `boom_tube`, `stick_tube` in the pins of the tubes; `boom_pin`, `stick_pin` in the pins of
+  the rods. `offset`: constant force of a drive.
+- Other studies have other counts: [designed excitation](excitation.md) counts parameters that are
+  determined despite noise, the [sensor study](sensor_study.md) has the friction of the drives only."""
 
 
 if __name__ == "__main__":

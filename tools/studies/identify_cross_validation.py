@@ -98,13 +98,15 @@ def report(trials: Sequence[list[Errors]], measured: Sequence[Errors]) -> str:
         "Models of the CAT 215 are identified from one motion and predict the forces of another."
         " Cells are RMS errors of the predicted force in N m for the swing and N for the cylinders;"
         " smaller is better. `as given` is the machine before identification, `noise alone` the"
-        " error of a perfect model with these sensors.", "",
+        " expected error of a perfect model with the stated sensor accuracy; the error in a single set of logs"
+        " may be smaller. `complete`: all masses; `reduced`: without those of tubes and rods.", "",
         f"Simulation, {len(trials)} trials, given parameters with errors of up to 15 %:", "",
         *rows([e for found in trials for e in found]), "",
-        f"Logs of an independent simulator without sensor errors ({CLEAN}), each run held out in"
-        " turn:", "",
+        f"Logs of an independent simulator with sensor noise and without a hidden effect ({CLEAN}), each run held"
+        " out in turn:", "",
         *rows(measured), "",
-        "Published for the excavator of Khoshzaban 1992 (all frequencies, with the noise and"
+        "Published for the excavator of Khoshzaban 1992 (without a low-pass filter; the tables above compare forces"
+        " below the frequency at which position noise dominates; with the noise and"
         " nominal model of that machine):", "",
         "| force of | complete | reduced | nominal |", "| --- | ---: | ---: | ---: |",
         *(f"| {d} | {c:.0f} | {r:.0f} | {n:.0f} |" for d, (c, r, n) in THESIS.items()), "",

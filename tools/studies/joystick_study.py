@@ -76,7 +76,8 @@ def coils_and_sensing() -> list[str]:
     stated = np.array([sensing.translation] * 3 + [sensing.rotation] * 3) / np.sqrt(12.0) * MICRO
     lines = [
         "## Coils and sensing", "",
-        "Condition number of M, with torques referred to the radius of the coils: "
+        "Condition number of M, the matrix that maps the coil currents to force and torque on the "
+        "flotor, with torques referred to the radius of the coils: "
         f"{coils.condition:.4f}. The weight of the flotor takes {np.abs(weight).max():.2f} of "
         f"{coils.max_current:g} A.",
         "",
@@ -84,7 +85,7 @@ def coils_and_sensing() -> list[str]:
         f"{1e6 * diodes.step:g} um. The table gives the standard deviation of the pose at the "
         "centre of the coils (lower is better), compared with rounding to the stated resolution.",
         "",
-        "| | x | y | z [um] | rx | ry | rz [0.001 deg] |", "| --- |" + " ---: |" * 6,
+        "| | x [um] | y [um] | z [um] | rx [0.001 deg] | ry [0.001 deg] | rz [0.001 deg] |", "| --- |" + " ---: |" * 6,
         "| diodes | " + " | ".join(f"{v:.2f}" for v in spread) + " |",
         "| stated | " + " | ".join(f"{v:.2f}" for v in stated) + " |", "",
     ]  # fmt: skip
@@ -111,7 +112,7 @@ def steps() -> list[str]:
         lines.append(f"| {name} | {' | '.join(cells)} |")
     lines += [
         "",
-        "The deviation is that of 5 ms: a current is held for 5 ms, and a difference of two "
+        "The deviation results from the sampling period of 5 ms: a current is held for 5 ms, and a difference of two "
         "readings is the velocity of 2.5 ms ago.",
         "",
         "| hovering for 10 s | largest error of the handle [um] | RMS [um] |"
@@ -215,8 +216,10 @@ def detent() -> list[str]:
     lines = [
         "## Detent", "",
         "x axis of the feller-buncher (Zhu 1994, Table 6.11 and Fig. 6.51). A clamp of 20 N/mm "
-        "moves the handle outwards and waits. The table compares the force of the clamp with the "
-        "law at that displacement.",
+        "moves the handle outwards and waits. The law: stiffness "
+        f"{1e-3 * gains.nominal_stiffness:g} N/mm inside the dead band, a force drop at its edge, "
+        f"{1e-3 * gains.detent.slope:g} N/mm outside. The table compares the force of the clamp "
+        "with it at that displacement.",
         "",
         "| displacement [mm] | force [N] | law [N] |", "| ---: | ---: | ---: |",
     ]  # fmt: skip
@@ -516,7 +519,8 @@ def report(results) -> str:
         "that of stiffness, or the coil loop ran faster than the 200 Hz of 5.3.",
         "- Without a hand, x and ry are unstable with every one of these springs at 200 Hz: a "
         "push at the handle tilts a free flotor. A handle without a hand is therefore held by "
-        "the law of 5.1.3.",
+        "the law of 5.1.3, which controls the six axes as uncoupled second-order systems by the pose "
+        "of the flotor.",
         "- Zhu 1994 does not state how the coil force decreases over the gap.",
         "",
     ]  # fmt: skip

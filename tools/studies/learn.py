@@ -281,7 +281,10 @@ def head(asked: argparse.Namespace) -> str:
         f"- The network, trained with PPO in {facts['steps']:,} steps, {does}. Its input is the"
         f" last {recipe.history} steps.\n"
         f"- Both controllers have {options}. {machines}\n"
-        f"- The reference was tuned on the training machines (`--tune`): {gains}.\n"
+        f"- The reference was tuned on the training machines (`--tune`): {gains}."
+        " Units of the gains: 1/s (`position`, `swing`, `pressure`), s (`lead`, `load_time`), 1/s^2 (`integral`). They"
+        " are those of the joint servo ([source](../../hydrotele/scenario/scenario.py), `Servo`); `swing` replaces"
+        " `position` for the swing, `integral` is an added integral term.\n"
         f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return and a"
         " smaller error are better."
     )

@@ -40,7 +40,8 @@ CUTS = (
 
 INTRODUCTION = (
     "This study computes the condition number, the ambiguity of the forward kinematics and the"
-    " speed of the regressor. A condition number of 1 is best. [The map](palida_workspace.png)"
+    " speed of the regressor. A condition number of 1 is best; rotations are multiplied by the radius of"
+    f" the platform's joints, {1e3 * RADIUS:g} mm. [The map](palida_workspace.png)"
     " shows the singularities and the workspace."
 )
 

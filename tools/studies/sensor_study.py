@@ -124,8 +124,10 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
     lines = [
         "Tables 14 and 15 of Khoshzaban 1992 ask how much better pressure sensors improve the"
         " identified parameters. This study repeats them with the CAT 215: errors of +-25 psi, +-5"
-        " psi and none, complete and reduced model. Every base parameter is estimated, identifiable"
-        " or not, as in the thesis.", "",
+        " psi and none, complete and reduced model. Every base parameter is estimated, even if noise"
+        " leaves it undetermined, as in the thesis. Complete: all masses and the friction of the drives; reduced:"
+        " without the masses of tubes and rods. [Other studies](identifiability.md) also count the friction of"
+        " joints and pins.", "",
         f"Cells are RMS errors over {len(results)} trials relative to the size of the parameter"
         " (geometric mean over the parameters); smaller is better. `true motion` uses the exact"
         " motion of the simulator, so that only pressures have errors.", "",

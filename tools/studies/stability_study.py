@@ -256,6 +256,10 @@ def main() -> None:
         "", "## Random factor", "", *table(plain),
         "", "## Factor close to the predicted limit", "", *table(aimed),
         "", "## Wrong predictions", "",
+        "Criterion that decided: poles of the mean loop; jitter, if the noise that it causes grows "
+        "although the mean loop is stable; with passivity control slave alone, if the slave with its own "
+        "controller is unstable, or bounded, if it is stable but not passive.",
+        "",
         "| structure | predicted | criterion | cases |", "| --- | --- | --- | ---: |",
         *(f"| `{n}` | {what} | {why} | {k} |" for (n, why, what), k in sorted(wrong.items())),
         "",
@@ -264,19 +268,22 @@ def main() -> None:
         f"runs, {decayed} also decayed.",
         "", "## The shipped case: operators and a released handle", "",
         "Sampled at 200 Hz, 20 ms each way. Operators: random, from a loose to a firm grip, with "
-        "tasks up to three times softer or stiffer. Master alone: Zhu 1994, 3.71 and 3.72. "
+        "tasks up to three times softer or stiffer. Master alone: unstable poles of the released "
+        "master without the slave's channel (Zhu 1994, 3.71 and 3.72). "
         "Llewellyn: minimum of the stability parameter; the structure is absolutely stable from "
         "1 on (higher is better). `hydrotele analyse teleop --robust` prints this table.",
-        "", *robust_table(), "", "The same at 1 kHz:", "", *robust_table(0.001),
+        "", *robust_table(), "", "The same at 1 kHz. Master alone, Llewellyn and "
+        "Z-width are those of the loop in continuous time and do not depend on the rate:", "", *robust_table(0.001),
         "", "## Stiffness feedback with the published gains (Zhu 1994, Tables 6.7 and 6.9)", "",
-        "Theorem 4-2 requires K_min > 0 and B^2 > 4 M K_max. No published axis meets the second "
+        "Theorem 4-2 requires K_min > 0 and B^2 > 4 M K_max (mass M, damping B and bounds K_min and K_max "
+        "of the stiffness of joystick and hand). No published axis meets the second "
         "condition. The worst switching between K_min and K_max still decays, at any time and "
         "for any cause: the damping exceeds the value at which one half swing is as large as the "
         "last. Growth below 1 decays (lower is better).",
         "", *spring_table(), "", "## Limits", "",
         "- Wave variables with the slave's damping as wave impedance are unstable at 200 Hz with "
-        "the handle released, because the flotor is light: b T / M is 2.4. At 1 kHz they are "
-        "stable.",
+        "the handle released, because the flotor is light: wave impedance times sampling period over "
+        "mass of the flotor is 2.4. At 1 kHz they are stable.",
         "- No published axis meets the sufficient condition of Theorem 4-2.",
         "- The switching bound holds for the assumed masses of flotor and hand "
         "(models/joystick). Twice the mass raises the required damping by a factor of 1.41.",

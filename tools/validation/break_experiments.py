@@ -12,6 +12,8 @@ import sys
 from hydrotele.experiments.comparison import run_with_faults
 from tools.studies.experiment_seeds import import_series, report_progress
 
+_PAGES = {"abdellatif2008": "parallel_robot"}  # page of the comparison, if its name differs
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -31,7 +33,12 @@ def main() -> None:
     lines = [
         f"# Broken runs of {arguments.name}", "",
         f"`python tools/validation/break_experiments.py {arguments.name}`", "",
-        "Every row is judged by runs with a planted fault, up to six repetitions.", "",
+        f"Each row of the [comparison]({_PAGES.get(arguments.name, arguments.name)}.md) is repeated with a planted"
+        " fault, up to six times. Its criterion works if the verdict is *differs*. For a row that differs",
+        "without the fault as well, the run only shows that the fault does not make it agree. `inf`: no limit, or the"
+        " numbers of parameters differ. `nan`, or a",
+        "very large number of standard deviations: with the fault the repetitions have no scatter, or the ratio is not"
+        " defined.", "",
         "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
     ]  # fmt: skip
     for claim, row in judged:

@@ -22,7 +22,7 @@ arguments = parser.parse_args()
 
 machine = load_machine(arguments.machine)
 relief = machine.supply.relief_pressure
-print("| run | step [ms] | angle [deg] | pressure [% of 28 MPa] | angle error / step |")
+print("| run | step [ms] | angle [deg] | pressure [% of 28 MPa] | angle error / step [deg/ms] |")
 print("| --- | ---: | ---: | ---: | ---: |")
 for log in load_logs(arguments.logs):
     for step in arguments.steps:

@@ -85,7 +85,9 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     for test, limit in LIMITS.items():
         rows[f"worst channel, {test}"] = ([n["tests"][test] for n in noted.values()], limit)
     lines = [
-        f"{len(noted)} simulated unchanged machines; motions and sensors of the blind validation.",
+        f"{len(noted)} simulated unchanged machines; motions and sensors of the"
+        " [blind validation](blind_trials/summary.md). Score: gain of twice the log evidence, less the complexity",
+        "penalty. The other figures are the [residual tests](../gap.md#residual-tests).",
         "",
         "| figure | " + " | ".join(f"{s:.0%} quantile" for s in _SHARES) + " | threshold |",
         "| --- |" + " --- |" * (len(_SHARES) + 1),
@@ -102,7 +104,8 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     pulled = [n["pulls"] for n in noted.values() if n["pulls"]]
     if pulled:
         lines += ["", "Estimate divided by its stated standard deviation,"
-                  f" {len(pulled)} machines (ideal: 1):",
+                  f" {len(pulled)} machines (ideal: 1; 0: these logs do not determine the effect,"
+                  " and the estimate stays at its nominal value):",
                   "", "| effect | RMS |", "| --- | --- |"]  # fmt: skip
         document["pulls"] = {}
         for key in pulled[0]:
