@@ -213,7 +213,8 @@ def update_max_pin_opening(ticks):
 
 def start_background_compilation() -> None:
     """Start to compile the tick loop of a teleoperated run in a separate process."""
-    compile_in_background(run_teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
+    name = compile_tick_loop.__name__
+    compile_in_background(run_teleoperated_ticks, f"from {__name__} import {name}; {name}()")
 
 
 def compile_tick_loop() -> None:
