@@ -105,17 +105,17 @@ class ArmFit:
 
     @property
     def standard_deviations(self) -> np.ndarray:
-        """(p,) standard deviations [rad] or [m]."""
+        """(p,) standard deviations of the identified values [rad] or [m]."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def intervals(self) -> np.ndarray:
-        """(p, 2) 95 % intervals [rad] or [m]."""
+        """(p, 2) lower and upper bounds of the 95 % intervals of the identified values [rad] or [m]."""
         reach = _QUANTILE_95 * self.standard_deviations
         return np.column_stack([self.values - reach, self.values + reach])
 
     def value(self, name: str) -> float:
-        """Return the value of a parameter by name [rad] or [m], nominal if it was not identified."""
+        """Return the value of a parameter by name [rad] or [m]; its start value if it was not identified."""
         return float(self.parameters[name])
 
 
@@ -195,11 +195,12 @@ class StageEquations:
         self.outer = loop.links[self.place :]
 
     def chain_and_angles(self, parameters: Mapping[str, float]) -> tuple[CalibrationLoop, np.ndarray]:
-        """Insert parameters into the chain, and compute the joint angles beyond the moving link.
+        """Insert parameters, given by name, into the chain, and compute the joint angles beyond the moving link.
 
-        Angles of held joints are parameters; those of the calibrator are readings plus offsets. The
-        angles have shape (M, number of links beyond the moving one) [rad]. The moving link's
-        own d keeps its nominal value, because only the difference p_z - d is identifiable.
+        The result is (chain, angles (M, number of links beyond the moving one) [rad]). Angles of
+        held joints are parameters, plus their drift if it is known. Angles of calibrator joints are
+        readings plus their offset parameters. The length d of the moving link keeps its nominal
+        value, because only the difference of the ball's height and this length is identifiable.
         """
         loop, poses = self.loop, self.poses
         values = np.array([[parameters[f"{kind}.{link}"] for kind in PARAMETER_KINDS] for link in loop.links])
@@ -221,16 +222,21 @@ class StageEquations:
         return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
     def residual(self, parameters: Mapping[str, float]) -> np.ndarray:
-        """Return the errors of both equations (M, 2) [m]: ball distance minus p_xy, height minus p_z."""
+        """Return the two errors of every pose (M, 2) [m], for parameters given by name.
+
+        They are the ball's distance from the moving joint's axis minus the parameter p_xy, and its
+        height along this axis minus the parameter p_z. Known drift of held links is subtracted.
+        """
         loop, theta = self.chain_and_angles(parameters)
         return self._error(ball_position_from_axis(loop, self.place, theta), parameters)
 
     def residual_and_jacobian(self, parameters: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the errors of both equations at every pose, and their derivatives.
+        """Compute both errors of `residual` at every pose, and their derivatives.
 
         Returns:
-            (residuals (M, 2) [m], derivatives by link parameters (M, 2, links, 5),
-            derivatives by the S calibrator readings (M, 2, S) [m/rad]).
+            (errors (M, 2) [m], derivatives by link parameters (M, 2, L, 5), derivatives by the S
+            calibrator readings (M, 2, S) [m/rad]). The L links are those from the moving one
+            outwards; their parameters are offset, alpha, a, d and beta.
         """
         loop, theta = self.chain_and_angles(parameters)
         s, by = ball_position_and_derivatives(loop, self.place, theta)
@@ -242,12 +248,13 @@ class StageEquations:
     def select_parameter_derivatives(
         self, derivatives: np.ndarray, names: Sequence[str], own_d: bool = False
     ) -> np.ndarray:
-        """Select the derivatives of the residuals by p named parameters.
+        """Select the derivatives of both errors of every pose by p named parameters.
 
         Args:
             derivatives: (M, 2, links, 5) derivatives by all link parameters, from `residual_and_jacobian`.
             names: names of the parameters.
-            own_d: whether to include the moving link's own d; otherwise its column is zero.
+            own_d: whether to return the derivative by the moving link's length d; otherwise its
+                column is zero, because the fit does not change this length.
 
         Returns:
             (M, 2, p) derivatives; zero for parameters without effect.
@@ -350,9 +357,10 @@ def identify_arm(
 def classify_candidates(
     equations: StageEquations, parameters: ParameterValues, names: Sequence[str]
 ) -> Identifiability:
-    """Classify the candidate parameters `names` of a stage: identifiable, in combination only, or not.
+    """Classify the candidate parameters `names` of a stage: identifiable or not.
 
-    The derivatives of the stage's equations are evaluated at the values `parameters`.
+    A parameter is identifiable alone, only in a combination with others, or not at all. The stage's
+    equations are linearised at the values `parameters`, by name.
     """
     loop = equations.loop
     _, by, sensed = equations.residual_and_jacobian(parameters)
@@ -374,10 +382,12 @@ def identify_stage(
         own_names: p parameters to identify.
         earlier_names: q parameters identified by earlier stages.
         covariance: (q, q) covariance of the earlier parameters.
-        identifiability: identifiability of the candidate parameters.
-        candidates: the candidate parameters.
-        weighted: as in `identify_arm`.
-        start_is_close: whether the start is close to the solution, so that no truncation is needed.
+        identifiability: classification of the candidate parameters by `classify_candidates`; the
+            result contains it.
+        candidates: names of the candidate parameters; the result states why the others are held.
+        weighted: weight each equation by its sensor noise; False for equal weights.
+        start_is_close: whether the start is close to the solution; otherwise the first search omits
+            steps in directions with small singular values.
 
     Returns:
         (result of the stage, values of all parameters, covariance (q + p, q + p) of earlier and own
@@ -460,7 +470,8 @@ def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationL
 def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> ArmFit:
     """Build the result of an arm calibration from the values and covariance of its parameters.
 
-    If the stage of the link nearest to the chassis identified the ball position, the chain contains it.
+    The calibrated chain gets the identified ball position, if the link nearest to the chassis moved
+    in one of the stages.
     """
     values = {name: parameters[name] for name in loop.parameter_names}
     calibrated = loop.with_values(values)
@@ -481,7 +492,8 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     """Refit the parameters of all stages together, starting from the link-by-link fit.
 
     A parameter enters the equations of every stage that depends on it; each stage has its own ball
-    position. The Jacobian is sparse: a stage does not depend on links inside its moving link.
+    position. The Jacobian is sparse: a stage does not depend on the links between the chassis and
+    its moving link.
 
     Args:
         fit: the link-by-link (hierarchical) fit.
@@ -565,15 +577,18 @@ def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
 
 
 def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
-    """Compute the two equation residuals of each pose of a stage, whitened by the sensor noise.
+    """Compute the two errors of each pose of a stage, whitened by the sensor noise.
+
+    The errors are the ball's distance from the moving axis and its height along it, each minus its
+    value in the parameters.
 
     Args:
         loop: the nominal chain.
         poses: poses of the stage.
-        parameters: parameters of a fit.
+        parameters: parameter values by name, from a fit.
 
     Returns:
-        (M, 2) whitened residuals, of unit variance if sensor noise is the only error.
+        (M, 2) whitened errors, uncorrelated and of unit variance if sensor noise is the only error.
     """
     equations = StageEquations(loop, poses)
     error, _, sensed = equations.residual_and_jacobian(parameters)
@@ -583,13 +598,13 @@ def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str
 def update_machine_geometry(machine: Machine, nominal: CalibrationLoop, loop: CalibrationLoop) -> Machine:
     """Return a machine whose link positions and joint axes are those of a calibrated chain.
 
-    The joint zeros of the machine are kept; a changed offset in the chain is a sensor error.
-    Cylinder pins keep their positions on their links.
+    The joint zeros of the machine are kept, because a changed angle offset in the chain describes a
+    sensor error. Cylinder pins keep their positions on their links.
 
     Args:
         machine: the machine.
         nominal: the chain of this machine.
-        loop: the chain with changed parameters.
+        loop: the calibrated chain.
 
     Returns:
         The machine with the chain's lengths, twists and ball joint position.
@@ -645,9 +660,10 @@ def _sort_links_by_depth(machine: Machine) -> list[str]:
 
 
 def _move_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
-    """Move the arm's tip if a link is attached at it, so that both stay at the same point.
+    """Return the machine with the arm's tip moved to a link that was attached at the tip.
 
-    `before` and `origin` are the origins of the links before and after the calibration [m].
+    If a link had its origin at the tip before the calibration, the tip gets the link's new origin.
+    `before` and `origin` contain the origins of all links before and after the calibration [m].
     """
     if machine.arm is None:
         return machine
@@ -666,8 +682,8 @@ def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -
     Args:
         machine: the nominal machine.
         fit: the calibrated arm.
-        stages: the poses; the manipulator's own readings, if any, at the identified held angles
-            give the offsets of its sensors.
+        stages: the poses. If they contain readings of the manipulator's sensors, the offsets of
+            these sensors are the mean readings minus the identified held angles.
 
     Returns:
         The machine with calibrated lengths, twists and ball joint, and with `sensor_errors` of

@@ -37,14 +37,16 @@ def read_calibration_poses(
         machine: the machine with its calibrator.
         loop: the closed chain of this machine and its calibrator.
         max_poses: maximum number of poses per log.
-        accuracy: standard deviation of an angle reading [rad]; by default that of the sensors named
-            in the log, or of Khoshzaban's resolvers.
+        accuracy: standard deviation of an angle reading [rad]; by default that of the sensor set
+            named in the log, otherwise that of resolvers with errors within 0.1 deg (Khoshzaban
+            1992).
 
     Returns:
         One set of poses per log, in the order of the files.
 
     Raises:
-        InputError: a channel is missing, the machine differs, or the moving link is unknown.
+        InputError: a channel is missing, a log is of another machine, or the moving link cannot be
+            found.
     """
     return [log_to_poses(log, machine, loop, max_poses, accuracy) for log in read_calibration_logs(path, machine)[0]]
 
@@ -57,7 +59,7 @@ def read_calibration_logs(path: Path, machine: Machine) -> tuple[tuple[Log, ...]
         machine: the machine, which defines column names and command ranges.
 
     Returns:
-        (logs, notes on repairs).
+        (logs, notes on data that were repaired).
 
     Raises:
         InputError: a log is invalid, is from another machine, or its time stamps follow no clock.
@@ -89,14 +91,16 @@ def log_to_poses(
         machine: the machine with its calibrator.
         loop: the closed chain of this machine.
         max_poses: maximum number of poses.
-        accuracy: standard deviation of an angle reading [rad]; None for that of the log's sensors, or
-            of Khoshzaban's resolvers.
+        accuracy: standard deviation of an angle reading [rad]; None for that of the sensor set
+            named in the log, otherwise that of resolvers with errors within 0.1 deg (Khoshzaban
+            1992).
 
     Returns:
         The poses, evenly spaced over the valid rows.
 
     Raises:
-        InputError: a channel is missing, fewer than two rows are valid, or the moving link is unknown.
+        InputError: a channel is missing, fewer than two rows are valid, or the moving link cannot
+            be found.
     """
     sensed = loop.channels[loop.powered_count :]
     if lacking := [name for name in sensed if name not in log]:
@@ -126,7 +130,8 @@ def log_to_poses(
 def _angle_noise_std(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
     """Return the noise of an angle channel's readings, a standard deviation [rad].
 
-    It is `accuracy` if given, otherwise that of the log's sensors or of a resolver.
+    It is `accuracy` if given, otherwise that of the sensor set named in the log. If the log names
+    none, it is that of a resolver with errors within 0.1 deg.
     """
     if accuracy is not None:
         return accuracy
@@ -230,7 +235,11 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], max_samples
 
 
 def _length_noise_std(log: Log, machine: Machine, channel: str) -> float:
-    """Return the noise of a displacement channel's readings, a standard deviation [m]."""
+    """Return the noise of a displacement channel's readings, a standard deviation [m].
+
+    It is that of the sensor set named in the log. If the log names none, it is that of a transducer
+    with errors within 2 mm.
+    """
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL_SENSORS:
         return reading_noise_rms(machine, get_sensor_set(machine, name), channel) or _TRANSDUCER_DEVIATION

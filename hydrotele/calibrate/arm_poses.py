@@ -74,16 +74,18 @@ _TREND_DEGREE = 2  # polynomial degree over the poses: leakage decreases while p
 def add_held_link_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
     """Estimate how held links drift during a measurement, and add this drift to the poses.
 
-    The drift is a polynomial of degree 2 through the readings of the manipulator's own sensors. Only
-    changes of the readings are used, so sensor offsets have no effect. The ball displacement caused
-    by drift of links inside the moving one is computed with the nominal chain.
+    The drift is a polynomial of degree 2 through the readings of the manipulator's own sensors.
+    Only changes of the readings are used, so sensor offsets have no effect. Drift of links between
+    the chassis and the moving one displaces the ball in the moving link's frame. This displacement
+    is computed with the nominal chain.
 
     Args:
         loop: the nominal chain.
         poses: poses with readings of the manipulator's sensors.
 
     Returns:
-        The poses with their drift; unchanged if there are no such readings.
+        The poses with their drift; unchanged without such readings, or if there are at most 10
+        poses.
     """
     place = loop.links.index(poses.link)
     u = np.linspace(-1.0, 1.0, len(poses))

@@ -188,9 +188,10 @@ def find_corrupted_regions(
 ) -> list[CorruptedRegion]:  # fmt: skip
     """Find sequences of poses (regions) whose residuals are too large to be sensor noise.
 
-    The cumulative sum of squared residuals less twice their expected value is followed along the
-    poses. Its largest rises are regions if they exceed the level that noise reaches in a fraction
-    `false_alarm` of the measurements (extreme value of a random walk with negative drift).
+    A score, the squared residuals of a pose minus twice their expected value, is summed along the
+    poses. Ranges of poses with the largest sums are regions if the sum exceeds a threshold. Noise
+    alone exceeds it in a fraction `false_alarm` of the measurements (extreme value of a random walk
+    with negative drift).
 
     Args:
         loop: the nominal chain.
@@ -280,9 +281,9 @@ def identify_without_bad_data(
 ) -> CleanedFit:
     """Identify the arm link by link without corrupted poses, which are found in each stage first.
 
-    A stage with regions is refitted to its most consistent poses first, so that a fit to corrupted
-    poses does not mask them. Regions in which only the manipulator's own sensor is wrong are kept,
-    because the identification does not use that sensor.
+    A stage with regions is first refitted to its poses with the smallest residuals, so that a fit
+    to corrupted poses does not mask them. Regions in which only the manipulator's own sensor is
+    wrong are kept, because the identification does not use that sensor.
 
     Args:
         loop: the nominal chain.
@@ -341,7 +342,8 @@ def identify_without_bad_data(
 def _refit_until_regions_stable(loop, poses, solve, found, total, false_alarm, names, own):
     """Alternate between the fit and the search for corrupted regions until the regions stay the same.
 
-    The first fits use only the poses with the smallest residuals.
+    The first fits use only the poses with the smallest residuals. The search also ends after eight
+    rounds, or if more than 70 % of the poses would be removed.
 
     Returns:
         (last fit, as returned by `identify_stage`; list of corrupted regions).
@@ -365,7 +367,7 @@ def _refit_until_regions_stable(loop, poses, solve, found, total, false_alarm, n
 
 
 def _mask_uncorrupted_poses(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
-    """Return a mask (count,) of the poses to keep: outside all regions that a calibrator joint corrupts."""
+    """Return a mask (count,), true for poses outside all regions with a faulty calibrator sensor."""
     kept = np.ones(count, bool)
     for region in regions:
         if region.joint:

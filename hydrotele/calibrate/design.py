@@ -117,7 +117,7 @@ def generate_sweep_poses(loop: CalibrationLoop, link: str, sweep: Sweep, seed: i
 
 
 def _grapple_angle_to_ball(loop: CalibrationLoop, theta: np.ndarray) -> np.ndarray:
-    """Return the grapple angle at which its yoke axis is perpendicular to the line to the ball."""
+    """Return the grapple joint's angles (M,) [rad] at which the calibrator's arm can point at the ball."""
     place, turn = frame_after_links(loop, loop.powered_count, theta)
     x, y, _ = np.einsum("mji,mj->im", turn, loop.ball - place)
     return np.arctan2(y, x)
@@ -176,7 +176,8 @@ def evaluate_calibrator_design(
 ) -> Design:
     """Evaluate how accurately a calibrator of given dimensions would calibrate the arm.
 
-    A complete measurement with one sweep per link is simulated; reach and covariance follow from it.
+    A complete measurement with one sweep per link is simulated. It gives the fraction of the poses
+    in reach and the covariance of the identified parameters.
 
     Args:
         loop: the nominal chain.
@@ -184,7 +185,7 @@ def evaluate_calibrator_design(
         forearm: length from elbow to ball [m].
         ball_x: position of the ball joint in front of the swing axis [m].
         ball_z: height of the ball joint above the boom pin [m].
-        max_angle_error: bound of a sensor's uniform error [rad].
+        max_angle_error: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
         The design with its figures of merit.
@@ -215,7 +216,10 @@ def evaluate_calibrator_design(
 
 
 def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
-    """Return names of the p identifiable parameters and the noise-weighted Jacobian (rows, p) of all stages."""
+    """Return the p identifiable parameters and the Jacobian (rows, p) of all stages' equations.
+
+    The rows are divided by the standard deviations of the equations' noise.
+    """
     numbers = initial_parameters(loop, stages)
     names: list[str] = []
     parts = []
@@ -234,7 +238,7 @@ def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[
 def _tip_position_std(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
     """Return the uncertainty of the arm's tip position due to a parameter covariance (p, p) [m].
 
-    It is the root mean square standard deviation over a few arm poses.
+    It is the root mean square standard deviation over five arm poses.
     """
     count = loop.powered_count - 1
     chain = link_chain(loop.values[:count])
@@ -253,14 +257,14 @@ def _tip_position_std(loop: CalibrationLoop, names: list[str], covariance: np.nd
 
 
 def evaluate_design_grid(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
-    """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint where it is.
+    """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint at its present place.
 
     Args:
         loop: the nominal chain.
-        accuracy: bound of a sensor's uniform error [rad].
+        accuracy: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
-        The designs, ordered by forearm length, and the present design.
+        The designs, ordered by forearm length, and the design of the present calibrator.
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
     grid = [
@@ -276,12 +280,13 @@ def evaluate_design_grid(loop: CalibrationLoop, accuracy: float) -> DesignSurvey
 def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float) -> Design:
     """Find the calibrator lengths and ball joint position with the smallest error of the arm's tip.
 
-    At least 98 % of the poses must be within the calibrator's reach.
+    Designs that reach fewer than 98 % of the poses get a penalty. The search is that of Nelder and
+    Mead.
 
     Args:
         loop: the nominal chain.
         survey: grid of designs, the best of which starts the search.
-        accuracy: bound of a sensor's uniform error [rad].
+        accuracy: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
         The design; the ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
@@ -425,7 +430,7 @@ def select_poses(
 
 
 def _log_det_gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return by how much each candidate's rows J (k, p) would increase the log determinant.
+    """Return by how much each candidate's rows J (k, p) would increase the log determinant of `total`.
 
     Args:
         total: (p, p) present information matrix.

@@ -102,18 +102,22 @@ class ParameterFit:
 
     @property
     def standard_deviations(self) -> np.ndarray:
-        """(p,) standard deviations; infinite for held parameters."""
+        """(p,) standard deviations of the fitted values; infinite for held parameters."""
         return np.where(self.held, np.inf, np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def intervals(self) -> np.ndarray:
-        """(p, 2) 95 % intervals; for a combination's representative, with the others held."""
+        """(p, 2) 95 % intervals of the fitted values; infinite for held parameters.
+
+        If only a combination of parameters is identifiable, one of them is fitted. Its interval
+        takes the others, which are held, as exact.
+        """
         reach = self.interval_quantile * self.standard_deviations
         return np.column_stack([self.values - reach, self.values + reach])
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residual."""
+        """Root mean square of the unweighted residuals at the solution."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     def value(self, name: str) -> float:
@@ -217,9 +221,9 @@ def classify_scaled_parameters(
     """Classify parameters: identifiable alone, only in a combination, or not at all.
 
     Without noise, a direction is unidentifiable if its singular value is below 1e-8 of the largest
-    one, with columns of length 1; 1e-8 is the square root of rounding. With noise, a parameter is
-    identifiable if its standard deviation is below half of its expected size. Otherwise the
-    measurement adds no information to what was known before.
+    one, with columns of length 1; 1e-8 is about the square root of the rounding error. With noise,
+    a parameter is identifiable if its standard deviation is below half of its expected size.
+    Otherwise the measurement adds little to what was known before.
 
     Args:
         jacobian: (m, p) derivatives of the equations.
@@ -353,11 +357,15 @@ class _Problem:
         return rows
 
     def residual_and_jacobian(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual (m,) and the Jacobian (m, p)."""
+        """Return the residuals (m,) and the Jacobian (m, p) at parameters x (p,)."""
         return self.residual_vector(x), self.jacobian(x)
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the dense Jacobian (m, p), given, or by complex steps or central differences."""
+        """Return the dense Jacobian (m, p) of the residuals at parameters x (p,).
+
+        It is computed by the caller's function if there is one, otherwise by complex steps (`cs`)
+        or central differences.
+        """
         if callable(self.jac):
             return _to_dense(self.jac(x))
         if self.jac == "cs":
@@ -390,7 +398,10 @@ def _to_dense(matrix) -> np.ndarray:
 
 
 def _group_columns(sparsity: np.ndarray) -> np.ndarray:
-    """Assign the columns of a mask (m, p) to groups without a common row; return group numbers (p,)."""
+    """Assign the p columns of a mask (m, p) to groups; return the group number of each column (p,).
+
+    No two columns of a group are true in the same row.
+    """
     groups: list[int] = []
     taken: list[np.ndarray] = []
     for column in sparsity.T:
@@ -420,32 +431,43 @@ class _ScaledProblem:
         self.has_prior = self.prior_weight > 0.0
 
     def add_scaled_step(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return base values (p,) with steps `u`, in units of the scales, added to the free parameters."""
+        """Return parameters (p,): `base` plus steps `u` of the free parameters, in units of their scales."""
         x = base.copy()
         x[self.free] += u * self.scales
         return x
 
     def weighted_residual(self, x: np.ndarray) -> np.ndarray:
-        """Return the weighted residuals followed by the prior's residuals."""
+        """Return the weighted residuals of the equations at parameters x (p,), followed by those of the priors.
+
+        The residual of a prior is the parameter's distance from its mean in standard deviations.
+        """
         away = self.prior_weight * (x[self.free] - self.mean) / self.scales
         return np.concatenate([self.problem.residual_vector(x) * self.weight, away[self.has_prior]])
 
     def weighted_jacobian(self, matrix: np.ndarray) -> np.ndarray:
-        """Convert a Jacobian (m, p) to that of `weighted_residual` by the scaled free parameters."""
+        """Return the derivatives of `weighted_residual` by the free parameters over their scales.
+
+        `matrix` (m, p) is the Jacobian of the unweighted equations by all parameters.
+        """
         weighted = matrix[:, self.free] * self.weight[:, None] * self.scales
         return np.vstack([weighted, np.diag(self.prior_weight)[self.has_prior]])
 
     def effective_parameters(self, matrix: np.ndarray) -> float:
         """Return the effective number of parameters that the equations determine rather than the prior.
 
-        It is the trace of the hat matrix over the rows of the equations with the Jacobian `matrix` (m, p).
+        It is the trace of the hat matrix (projection on the Jacobian's columns) over the rows of
+        the equations, whose Jacobian is `matrix` (m, p).
         """
         whole = self.weighted_jacobian(matrix)
         q = np.linalg.qr(whole)[0][: len(matrix)]
         return float(np.sum(q**2))
 
     def solve(self, begin: _SearchState, truncation: Sequence[float] | None, max_steps: int) -> _SearchState:
-        """Search for the minimum from the end of a previous search, with or without truncation."""
+        """Search for the minimum from the end `begin` of a previous search, and return the end of this one.
+
+        With `truncation`, thresholds relative to the largest singular value, steps omit directions
+        with smaller singular values. Without, SciPy's Levenberg-Marquardt search is used.
+        """
         found = (
             _minimize_truncated(self, begin, truncation, max_steps)
             if truncation
@@ -454,7 +476,11 @@ class _ScaledProblem:
         return replace(found, rounds=begin.rounds + 1)
 
     def covariance(self, matrix: np.ndarray, truncation) -> tuple[np.ndarray, int]:
-        """Return the covariance (p, p) for the Jacobian `matrix`, zero for held parameters, and the rank."""
+        """Return the covariance (p, p) of the parameters, zero for held ones, and the number of fitted directions.
+
+        `matrix` (m, p) is the Jacobian of the equations. Directions with singular values below the
+        last threshold of `truncation` are left out.
+        """
         whole = self.weighted_jacobian(matrix)
         _, s, v = np.linalg.svd(whole, full_matrices=False)
         cut = truncation[-1] if truncation else len(self.free) * np.finfo(float).eps
@@ -466,7 +492,10 @@ class _ScaledProblem:
 
 
 def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps: int) -> _SearchState:
-    """Run SciPy's Levenberg-Marquardt search, limited to 10 `max_steps` residual evaluations."""
+    """Run SciPy's Levenberg-Marquardt search from `begin`, and return its end.
+
+    It is limited to `10 max_steps` evaluations of the residuals.
+    """
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
         lambda u: search.weighted_residual(search.add_scaled_step(base, u)), np.zeros(len(search.free)),
@@ -549,7 +578,7 @@ def _classify_in_noise(matrix: np.ndarray, problem: _Problem, identifiability: I
 
 
 def _remove_scales(identifiability: Identifiability, sizes: np.ndarray) -> Identifiability:
-    """Convert combinations of parameters over their sizes to combinations of the parameters themselves."""
+    """Convert combinations of parameters over their `sizes` to combinations of the unscaled parameters."""
     combination = identifiability.combination * sizes[identifiability.base][:, None] / sizes
     return Identifiability(
         identifiability.names,

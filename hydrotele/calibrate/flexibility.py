@@ -44,7 +44,8 @@ def relative_lever_arms(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.
     """Compute the relative load of each calibrator joint: horizontal distance to the ball over maximum reach.
 
     Returns:
-        (M, S) relative loads from 0 to 1 for the M poses of one stage (one moving link) and the S sensed joints.
+        (M, S) relative loads from 0 to 1 for the M poses of one stage (one moving link) and the S
+        joints of the calibrator. Maximum reach is the sum of the link lengths beyond a joint.
     """
     equations = StageEquations(loop, poses)
     chain, theta = equations.chain_and_angles(fit.parameters)
@@ -70,8 +71,8 @@ def relative_lever_arms(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.
 def add_flexibility_to_noise(loop: CalibrationLoop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
     """Return poses whose sensor noise includes the bending of the calibrator's joints under load.
 
-    The noise `sigma` (M, S) is the sensors' own and the flexibility (S,) [rad] times the relative load,
-    added as squares.
+    The variance of a reading becomes that of its sensor plus the square of `flexibility` (S,) [rad]
+    times the relative load of the joint (from 0 to 1).
     """
     loads = relative_lever_arms(loop, poses, fit)
     return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
@@ -126,7 +127,7 @@ def refit_with_flexibility(
         loop: the nominal chain.
         stages: poses with the sensors' own standard deviations.
         fit: fit of these poses, the start of the search.
-        refit: identification of poses, hierarchical or joint.
+        refit: function from poses to a fit, such as `identify_arm`.
 
     Returns:
         The fit weighted by the noise model, and the flexibility.

@@ -71,7 +71,7 @@ class PoseEquations:
 
     @property
     def scales(self) -> np.ndarray:
-        """(q,) scales of the free parameters."""
+        """(q,) expected sizes (scales) of the free error parameters [m] or [rad]."""
         return self.model.scales[self.model.parameter_indices(self.names)]
 
     def expand_to_all_parameters(self, values: np.ndarray) -> np.ndarray:
@@ -228,7 +228,7 @@ class PoseErrors(NamedTuple):
     orientation: np.ndarray
 
     def summarize(self) -> dict[str, float]:
-        """Return RMS and maximum errors in mm and mrad."""
+        """Return RMS and largest errors of position [mm] and orientation [mrad] by name."""
         return {
             "position_rms_mm": 1e3 * float(np.sqrt(np.mean(self.position**2))),
             "position_max_mm": 1e3 * float(self.position.max()),
@@ -285,7 +285,7 @@ class Calibration:
 
     @cached_property
     def leave_one_out_errors(self) -> PoseErrors:
-        """Errors of each pose, predicted by a calibration to all other poses."""
+        """Errors of poses, each predicted by a calibration to all other poses; of at most 200 poses."""
         return _leave_one_out_errors(self.equations, self.fit)
 
     @property
@@ -306,7 +306,7 @@ def calibrate_hybrid_robot(
     Args:
         robot: nominal robot.
         measurement: measured poses.
-        kind: kind of error model.
+        kind: error model, `dh` (errors of D-H rows) or `poe` (errors of axis lines).
         names: free parameters; by default all parameters of the model.
         prior: prior of the free parameters; by default none.
 
@@ -340,14 +340,14 @@ def calibrate_best_model(robot: HybridRobot, measurement: Measurement, names: Se
          ) -> Calibration:  # fmt: skip
     """Calibrate with both error models; return the calibration that predicts left-out poses better.
 
-    The models are `dh` (errors of D-H rows) and `poe` (errors of axis lines). `dh` is
-    preferred unless `poe` is better by more than 5 %. A robot specified by its axes has the `poe`
-    model only.
+    The models are `dh` (errors of D-H rows) and `poe` (errors of axis lines). `dh` is preferred
+    unless `poe` is better by more than 5 %. A robot specified by its axes has the `poe` model only.
+    If `names` are given for another robot, only `dh` is calibrated.
 
     Args:
         robot: nominal robot.
         measurement: measured poses.
-        names: free parameters of the `dh` model; by default all.
+        names: free parameters; by default all.
 
     Raises:
         InputError: as in `calibrate_hybrid_robot`.
@@ -414,8 +414,9 @@ def _check_poses(eq: PoseEquations) -> None:
 def _find_inconsistent_pose(eq: PoseEquations, fit: ParameterFit) -> int | None:
     """Find the pose whose residual is least likely to be noise; return None if all can be noise.
 
-    The influence of each pose on the fit is removed from its six residuals. Relative to the noise
-    of the other poses, their mean square follows an F(6, rest) distribution.
+    The influence of each pose on the fit is removed from its six residuals. Over the mean square of
+    the other poses, with `rest` degrees of freedom, their mean square has an F(6, rest)
+    distribution.
     """
     n = len(eq.measurement)
     residual = fit.residual.reshape(n, LEG_COUNT)

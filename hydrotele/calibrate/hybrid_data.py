@@ -337,7 +337,7 @@ def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_
 
 
 def _check_covariance(file: Path, covariance: np.ndarray) -> None:
-    """Raise InputError if the stated noise gives the legs a standard deviation outside 1e-9 to 1 m."""
+    """Raise InputError if the smallest standard deviation of a leg residual is outside 1e-9 to 1 m."""
     finite = np.isfinite(covariance).all()
     smallest = float(np.linalg.eigvalsh(covariance)[:, 0].min()) if finite else np.inf
     if not _MIN_NOISE**2 <= smallest <= _MAX_NOISE**2:
@@ -372,12 +372,12 @@ def save_measurement(
 
     Args:
         folder: existing folder.
-        stem: `POSES_STEM` or `HELDOUT_STEM`.
+        stem: name of the file without suffix, `poses` or `heldout`.
         robot: robot that has these joints.
         joints: (N, n) carriage readings [m] or [rad].
         legs: (N, 6) leg readings [m].
-        pose: measured poses, or None.
-        wires: (N, 6) wire lengths [m], or None.
+        pose: measured platform poses; None to write none.
+        wires: (N, 6) wire lengths [m]; None to write none.
     """
     columns: dict[str, np.ndarray] = {}
     for name, kind, values in zip(robot.joints, robot.kinds, joints.T, strict=True):

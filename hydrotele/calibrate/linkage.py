@@ -91,7 +91,11 @@ class LinkageFit:
 
 
 def piston_displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.ndarray:
-    """Return the piston displacement (n,) [m] for parameters as `PARAMETER_NAMES`, at angles (n,) [rad]."""
+    """Return the piston displacements (n,) [m] of a cylinder at joint angles (n,) [rad].
+
+    `values` are the angle offset, lower pin distance, closed length and upper pin distance of its
+    triangle. `direction` is +1 if the cylinder extends as the angle increases, otherwise -1.
+    """
     offset, lower, closed, upper = values
     return TwoBar(lower, upper, offset, direction).length(angle) - closed
 
@@ -217,15 +221,17 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
 def compute_angles_from_calibrator(fit: ArmFit, poses: Poses) -> np.ndarray:
     """Compute the moving joint's angle at every pose from the calibrator's readings alone.
 
-    The ball's direction relative to the joint's axis rotates opposite to the joint. Its zero is
-    known up to the parameters of the links inside; the linkage's angle offset absorbs this error.
+    The ball's direction relative to the joint's axis rotates opposite to the joint. The zero of the
+    angle depends on the links between chassis and joint, whose errors shift all angles equally; the
+    angle offset of a linkage fitted later absorbs this shift.
 
     Args:
         fit: fit of the arm.
         poses: poses of the link's stage.
 
     Returns:
-        (M,) angles, machine's sign [rad], on the branch nearest to the nominal home angle.
+        (M,) angles, machine's sign [rad], with the number of turns nearest to the nominal home
+        angle.
     """
     loop = fit.nominal
     equations = StageEquations(loop, poses)

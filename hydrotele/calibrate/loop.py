@@ -164,8 +164,8 @@ def ball_position_and_derivatives(
 
     The joint's own angle is taken as 0.
 
-    `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` of K Eqs 3.23 and 3.24, with
-    `d_i` added to its z.
+    `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` (Khoshzaban 1992, Eqs 3.23 and
+    3.24), with `d_i` added to its z.
 
     Args:
         loop: the chain.
@@ -183,11 +183,11 @@ def ball_position_and_derivatives(
 
 
 def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the distance between chain end and ball, and its derivatives by the joint angles.
+    """Compute the vector from the ball to the end of the chain, and its derivatives by the joint angles.
 
     Args:
         loop: the chain.
-        theta: (M, N) joint angles with their offsets [rad], K's signs.
+        theta: (M, N) joint angles with their offsets [rad], with the signs of Khoshzaban 1992.
 
     Returns:
         (end of chain minus ball (M, 3) in frame 0 [m], derivatives (M, 3, N) [m/rad]).
@@ -383,10 +383,10 @@ def _common_normal_feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_calibrator_angles(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the calibrator's three joint angles that put the chain's end at the ball, elbow hanging.
+    """Compute the calibrator's three joint angles that put the chain's end at the ball.
 
-    The closed-form solution for a yoke, twist and elbow with axes that intersect at right angles is
-    the start of Newton's method for the actual chain.
+    Newton's method solves the chain. It starts from the closed-form solution for a yoke, twist and
+    elbow with axes that intersect at right angles, with an elbow angle within 90 deg of zero.
 
     Args:
         loop: the chain; its last three links are yoke, twist and elbow.

@@ -69,9 +69,9 @@ def estimate_prior_std_by_kind(
 ) -> ErrorSizes:  # fmt: skip
     """Estimate the prior standard deviation of each kind of parameters, and the noise, by maximum evidence.
 
-    For `right_hand_side = matrix x + error` with x ~ N(0, s_kind^2), iterates the fixed point
-    `s^2 = sum x^2 / sum g`, `noise^2 = |error|^2 / (freedom - sum g)` with `g = 1 - S_ii / s^2`,
-    the fraction of a parameter determined by the measurements, and S its covariance.
+    For `right_hand_side = matrix x + error` with x ~ N(0, s_kind^2), a fixed point is iterated:
+    `s^2 = sum x^2 / sum g`, `noise^2 = |error|^2 / (freedom - sum g)`. Here S is the covariance of
+    x, and `g = 1 - S_ii / s^2` is the fraction of a parameter that the measurements determine.
 
     Args:
         matrix: (m, p) equations with the unknown noise.
@@ -126,12 +126,12 @@ def cross_validation_error(
     matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes,
     known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> float:  # fmt: skip
-    """Return the RMS error of equations predicted by cross-validation.
+    """Return the RMS error of equations, each predicted by a fit to the equations of all other folds.
 
     Args:
         matrix: (m, p) equations, linear in the parameters.
         right_hand_side: (m,) right-hand side of the equations.
-        folds: (m,) fold of each equation.
+        folds: (m,) number of the fold, a group that is left out together, of each equation.
         sizes: standard deviations of parameters and noise, the same for all folds.
         known: equations (r, p) with an error of standard deviation 1, their right-hand side (r,) and
             folds (r,). They are fitted with the other folds but not predicted. Without the distance
@@ -311,7 +311,7 @@ class _SocketProblem:
         return 3 * (len(self.joints) - len(self.sockets))
 
     def socket_means(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of each socket's rows, (sockets, ...) from (n, ...)."""
+        """Return the means of values (n, ...) over the rows of each socket, (sockets, ...)."""
         total = np.add.reduceat(values, self.first, axis=0)
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
@@ -328,7 +328,8 @@ class _SocketProblem:
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return the residuals [m]: ball positions minus their socket's mean, then socket distance errors.
 
-        A distance error is the distance of two neighbouring means minus the stated one.
+        A distance error is the distance of the mean ball positions in two neighbouring sockets
+        minus the stated distance.
         """
         balls = self.predict_balls(x)
         means = self.socket_means(balls)
@@ -365,7 +366,8 @@ def choose_robot(sockets: Sequence[Socket]) -> tuple[SerialRobot, dict[str, floa
         sockets: the measurements.
 
     Returns:
-        The robot, and the median scatter [m] of every candidate with its ball fitted.
+        The robot, and the median scatter [m] of the ball in its sockets by candidate, with the ball
+        position in the last link fitted.
 
     Raises:
         InputError: no shipped robot has this number of joints, or all have a large scatter.
@@ -513,7 +515,7 @@ def move_far_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> Seria
 
 
 def _median_reach(problem: _SocketProblem) -> float:
-    """Return the median distance of the ball from the first joint [m]."""
+    """Return the median distance [m] of the nominal ball positions of all rows from the first joint."""
     balls = problem.predict_balls(problem.start)
     return float(np.median(np.linalg.norm(balls - problem.robot.joints[0].origin[:3, 3], axis=1)))
 
@@ -615,7 +617,8 @@ class _FitState:
 def _alternate_fit_and_prior(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
     """Alternate between a fit of the parameters and an estimate of prior sizes and noise.
 
-    It stops when the noise changes by less than 0.1 %.
+    It stops when the noise changes by less than 0.1 %, or after six fits. Prior sizes are the
+    standard deviations of the parameters' priors.
     """
     kinds = _parameter_kinds(problem)
     if begin is None:
@@ -647,7 +650,7 @@ def _alternate_fit_and_prior(problem: _SocketProblem, begin: _FitState | None) -
 
 
 def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
-    """Fit the parameters with the estimated noise and prior sizes, and classify their identifiability."""
+    """Fit the parameters with the estimated noise and prior deviations, and classify their identifiability."""
     sigma = problem.equation_standard_deviations(state.sizes.noise)
     fit = least_squares(
         problem.residual, state.x, problem.names, np.maximum(state.sizes.std, 1e-12), sigma=sigma,
@@ -674,9 +677,10 @@ def _representative_rank(name: str) -> int:
 
 
 def _identifiability_scales(problem: _SocketProblem, state: _FitState) -> np.ndarray:
-    """Return the sizes (p,) below which a parameter's uncertainty must be for it to be identifiable.
+    """Return the sizes (p,) with which the standard deviations of parameters are compared.
 
-    They are the estimated prior standard deviations with a lower bound.
+    A parameter is identifiable if its standard deviation is below half of its size. Sizes are the
+    estimated prior standard deviations with a lower bound.
     """
     sag = np.array([name.startswith("sag") for name in problem.names])
     return np.maximum(state.sizes.std, np.where(sag, 0.1 * _START_SAG_SIZE, 0.1 * _START_SIZE))
@@ -844,7 +848,7 @@ def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[
 
 
 def _extend_state(problem: _SocketProblem, state: _FitState) -> _FitState:
-    """Append joint correction parameters, with value 0 and start sizes, to a state of the rigid model."""
+    """Append joint correction parameters, with value 0 and start prior deviations, to a state of the rigid model."""
     more = [_START_SAG_SIZE if name.startswith("sag") else _START_SIZE for name in problem.extra]
     sizes = ErrorSizes(np.append(state.sizes.std, more), state.sizes.noise, state.sizes.effective_parameters, 0)
     return _FitState(np.append(state.x, np.zeros(len(more))), sizes)

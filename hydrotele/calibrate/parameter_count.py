@@ -28,7 +28,7 @@ _SUBSPACES = {
 
 
 def count_serial_parameters(revolute: int, prismatic: int, pose: int = 6) -> int:
-    """Count the identifiable kinematic parameters of a serial robot: C = 4 R + 2 P + T (Wang Eq. 4).
+    """Count the identifiable kinematic parameters of a serial robot: C = 4 R + 2 P + T (Wang 2012, Eq. 4).
 
     Args:
         revolute: number of revolute joints, R.
@@ -47,10 +47,10 @@ def count_serial_parameters(revolute: int, prismatic: int, pose: int = 6) -> int
 def count_parallel_parameters(
     *, revolute: int, prismatic: int, spherical_pairs: int, encoders: int, loops: int, frames: int
 ) -> int:
-    """Count the identifiable kinematic parameters of a mechanism with closed loops (Wang Eq. 5).
+    """Count the identifiable kinematic parameters of a mechanism with closed loops (Wang 2012, Eq. 5).
 
     C = 3 R + P + SS + E + 6 L + 6 (F - 1). Without loops, with all joints measured and two frames
-    this is Eq. 4 with T = 6.
+    this is `count_serial_parameters` with T = 6.
 
     Args:
         revolute: number of revolute joints, R.
@@ -121,7 +121,7 @@ class Mechanism:
         return {joint.name: joint for chain in self.chains for joint in chain.joints}
 
     def count_parameters(self) -> int:
-        """Count the parameters by Wang's Eq. 5; each chain after the first closes one loop."""
+        """Count the parameters by `count_parallel_parameters`; each chain after the first closes one loop."""
         kinds = [joint.kind for joint in self.joints.values()]
         pairs = {(one.name, two.name) for chain in self.chains
                  for one, two in pairwise(chain.joints)
@@ -177,8 +177,8 @@ def identifiable_rank(
     """Compute the number of identifiable parameters as the rank of a Jacobian at random poses.
 
     At each pose the errors of links x and of passive joints y satisfy P x + Q y = e, six equations
-    per chain, where e are errors of the measured pose. The columns of y are eliminated. The rank of
-    the remaining P, stacked over the poses, is the number of identifiable parameters.
+    per chain. Here e are the errors of the measured pose. The columns of y are eliminated. The rank
+    of the remaining P, stacked over the poses, is the number of identifiable parameters.
 
     Args:
         mechanism: mechanism; its links get dimensions of about 1 m.

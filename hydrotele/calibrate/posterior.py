@@ -51,10 +51,10 @@ def minimize_by_evolution(
 ) -> EvolutionResult:  # fmt: skip
     """Minimise a function by differential evolution, without gradient or start values.
 
-    The strategy is `randtobest1bin` with crossover 0.95 and a varying mutation. Calibration errors
-    are strongly correlated, so most coordinates must change together, and a population that only
-    follows its best member converges prematurely. The search ends when the costs of the population
-    differ by less than `cost_tolerance`.
+    The strategy is SciPy's `randtobest1bin` with crossover 0.95 and a varying mutation. Calibration
+    errors are strongly correlated, so most coordinates must change together, and a population that
+    only follows its best member converges prematurely. The search ends when the costs of the
+    population differ by less than `cost_tolerance`.
 
     Args:
         cost: function of (S, p) parameter sets, such as half the weighted sum of squares.
@@ -129,7 +129,7 @@ class Posterior:
 
     @property
     def flat_sample(self) -> np.ndarray:
-        """(draws times walkers, p) sample without the chain structure."""
+        """(draws times walkers, p) draws of all walkers in one array."""
         return self.sample.reshape(-1, self.sample.shape[-1])
 
     @property

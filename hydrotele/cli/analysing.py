@@ -84,12 +84,12 @@ _ROBUST_LEGEND = (
 
 
 class RobustnessOptions(NamedTuple):
-    """Options of the robustness analysis: sampling, jitter of the delays and random operators.
+    """Options of the robustness analysis, which adds sampling, varying delays and random operators.
 
     Attributes:
-        period: sampling period of both sides [s].
-        delays: CSV file of measured delays, None for the delays of the case.
-        operators: number of random pairs of operator and task.
+        period: sampling period of the controllers of joystick and machine [s].
+        delays: CSV file of measured packet delays, None for the constant delays of the case.
+        operators: number of pairs of random operator and task impedances to test.
     """
 
     period: float = 0.005
@@ -186,9 +186,10 @@ def analyse_case(
 
 
 def _packet_ages(case: TeleoperatorAxis, robustness_options: RobustnessOptions) -> PacketAges:
-    """Return the distribution of the packet ages at the sampling instants, in sampling periods.
+    """Return how often the newest received packet is 0, 1, 2, ... sampling periods old when it is used.
 
-    The delays are those of the CSV file in the options, else the constant delays of the case.
+    The result has one distribution per direction. The packet delays are those of the CSV file in the
+    options, else the constant delays of the case.
 
     Raises:
         InputError: period, number of operators or file are not usable.
@@ -326,14 +327,17 @@ def analyse_case_or_scenario_to_folder(
 
 
 def analyse_scenario(scenario: Scenario, coordinate: str | None = None) -> ScenarioFindings:
-    """Linearise a teleoperated scenario about its contact pose and analyse its force-reflection loop.
+    """Linearise a teleoperated scenario in contact and analyse the stability of its force reflection.
+
+    The machine touches the scenario's plate, or else stiff ground at its start pose.
 
     Args:
         scenario: the scenario.
-        coordinate: coordinate of the arm, such as `r` or `z`; default that of the operator's force target, else z.
+        coordinate: coordinate of the arm's tip to analyse, such as `r` or `z`. By default it is the one in
+            which the simulated operator controls a force, otherwise z.
 
     Returns:
-        Stability, margins and limits of the loop.
+        Stability and margins of the loop, and those of the joystick under stiffness feedback.
 
     Raises:
         InputError: the scenario has no force-reflection loop.
@@ -355,7 +359,7 @@ def analyse_scenario_to_folder(
     Args:
         name: name or file of the scenario.
         target: output folder, default `runs/analyse_<name>`, or none with `as_json`.
-        coordinate: coordinate of the arm, None for the default.
+        coordinate: coordinate of the arm's tip to analyse, None for the default of `analyse_scenario`.
         overrides: scenario overrides, {key path: YAML text}.
         as_json: print `analysis.json` instead of text.
 

@@ -61,13 +61,14 @@ def measure_speed(repeats: int) -> dict:
     """Measure simulation speed and start-up time; each time is the shortest of several repetitions.
 
     Args:
-        repeats: number of repetitions; `hydraulics_to_mechanism_ratio` uses six times as many.
+        repeats: number of repetitions; the two times per step use six times as many.
 
     Returns:
-        mechanism_us, hydraulics_us: time of one step without and with hydraulics [us];
-        hydraulics_to_mechanism_ratio; scenario_realtime_factor; teleoperation_realtime_factor by
-        scenario; batch_steps_per_s by thread count; batch_scaling: speed ratio of two threads to
-        one; help_s, run_s: duration of two commands in a new process [s].
+        mechanism_us, hydraulics_us: computing time of one step without and with hydraulics [us];
+        hydraulics_to_mechanism_ratio: their ratio. The realtime factors are simulated time over
+        computing time, for teleoperation by scenario. batch_steps_per_s: by thread count;
+        batch_scaling: speed of two threads over that of one. help_s, run_s: duration of `--help`
+        and of a run of 1 s in a new process [s].
     """
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")

@@ -63,7 +63,8 @@ class ArmChoices(NamedTuple):
         poses: number of poses used of each log.
         accuracy_deg: standard deviation of an angle sensor [deg], None for that of the log.
         bad_data: whether corrupted samples are detected and excluded.
-        drift: whether the drift of held links is corrected by the arm's own sensors.
+        drift: whether slow motion of links that should be at rest is read from the arm's sensors
+            and corrected.
         heldout: N as text: every N-th pose is held out; None for 5.
         flexibility: whether the flexibility of the calibrator's joints is estimated.
     """
@@ -81,10 +82,10 @@ class ArmResult(NamedTuple):
     """Result of an arm calibration.
 
     Attributes:
-        machine: nominal machine.
+        machine: machine with the parameters before the calibration.
         fit: fitted parameters of the arm.
-        stages: fitted poses, one item per log.
-        regions: corrupted samples that were excluded.
+        stages: poses used for the fit, one item per log.
+        regions: intervals of corrupted samples that were excluded.
         heldout_errors: errors on held-out poses, empty without such poses.
         calibrated: machine with the fitted parameters.
         flexibility: flexibility of the calibrator's joints, None if it was not estimated.
@@ -201,8 +202,9 @@ def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Pose
     """Return how well the kinematic loop of arm and calibrator closes on held-out poses.
 
     Returns:
-        Number of poses; RMS closure error with nominal parameters (mean removed) and with identified
-        ones [mm]; chi: RMS of the latter divided by sensor noise. Empty without held-out poses.
+        `poses`: their number. `rms_nominal_mm`: RMS gap of the loop with the parameters before the
+        fit, without its mean. `rms_identified_mm`: RMS gap with the fitted parameters. `chi`: RMS of
+        these gaps over their standard deviation due to sensor noise. Empty without held-out poses.
     """
     if not heldout_poses:
         return {}
@@ -344,7 +346,9 @@ def write_arm_report(folder: Path, result: ArmResult) -> None:
 
 
 def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None, as_json: bool) -> list[LinkageFit]:
-    """Calibrate the pin triangles of the cylinders that move in a folder of logs; print and write them.
+    """Calibrate the pin positions of the cylinders that move in a folder of logs; print and write them.
+
+    Each cylinder forms a triangle of its two pins and the joint that it turns.
 
     Args:
         data: folder of logs.
@@ -384,7 +388,7 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
 
 
 def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport = ignore_stage) -> list[LinkageFit]:
-    """Fit the pin triangle of each cylinder to joint angles and cylinder lengths; write no files.
+    """Fit the triangle of joint and two pins of each cylinder to joint angles and lengths; write no files.
 
     Args:
         nominal: nominal machine.
@@ -463,9 +467,10 @@ def _print_linkages(document: Mapping[str, Any]) -> None:
 
 
 def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as_json: bool) -> None:
-    """Evaluate lengths and ball-joint positions of a calibrator; print the present and the best design.
+    """Search for the link lengths and ball-joint position of a calibrator that give the best calibration.
 
-    With a target, all designs are drawn and written as JSON.
+    The present and the best design are printed. With a target, all evaluated designs are drawn and
+    written as JSON.
 
     Args:
         machine: machine with a calibrator, as a shipped name or a folder.

@@ -48,7 +48,7 @@ class MachineCalibration(NamedTuple):
 
     Attributes:
         arm: links, joint axes and sensor offsets.
-        linkages: cylinder pins and closed lengths, one item per axis that moves.
+        linkages: pin positions and retracted lengths of the cylinders, one item per axis that moves.
         linkages_skip_reason: reason why the linkages were not calibrated, empty if they were.
         kinematic_machine: machine after the calibration of arm and linkages.
         dataset: logs of the dynamic step, loaded with that machine.

@@ -274,7 +274,7 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
 def _load_or_choose_robot(
     data: Path, robot_option: str | None, sockets: Sequence[Socket], options: SocketOptions
 ) -> tuple[SerialRobot, list[str]]:
-    """Load the robot of the option, else the file in the data folder, else the best shipped robot.
+    """Load the robot of the option, else the file in the data folder, else the shipped robot that fits best.
 
     Returns:
         The robot, and a note if it was not given by the option.

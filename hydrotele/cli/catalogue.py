@@ -113,7 +113,7 @@ def _wrap_text(text: str, width: int, further_indent: str = "") -> list[str]:
 def _format_item_property(name: str, value) -> str:
     """Format a property of an item as `name: value`, or a description as it is.
 
-    A dict is the parameters of an effect, {name: unit, low and high}.
+    Parameters of an effect are given as a dict, name -> unit and bounds, and become one text.
     """
     if isinstance(value, dict):
         value = ", ".join(f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items())
@@ -176,8 +176,9 @@ def _sweep_rows() -> list[dict]:
 def _effect_rows() -> list[dict]:
     """Return a row for each effect, with the components of a machine that it can change.
 
-    The machine is the first that supports the effect, beginning with the CAT 215 with bucket. The
-    parameter ranges are those of the last component.
+    The components are those of one machine: of the CAT 215 with bucket if it supports the effect,
+    otherwise of the first shipped machine that does. The parameter ranges are those of the last
+    component.
     """
     from hydrotele.effects import EFFECTS
 

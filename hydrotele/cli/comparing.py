@@ -58,7 +58,7 @@ class ModelComparison:
 
     Attributes:
         name: name or folder that the user gave.
-        kind: `machine` or `baseline`.
+        kind: `machine`, or `baseline` for a black-box model.
         runs: prediction errors, one item per run.
         plotted_prediction: (n, c) open-loop predictions of n rows and c channels of the first run.
     """

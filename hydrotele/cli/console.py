@@ -32,7 +32,7 @@ class _Console(Console):
     """Console that interprets only a few styles in brackets; other brackets are printed."""
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return the text with its styles; print unknown or unmatched tags unchanged."""
+        """Return a text in which known style tags are applied; unknown or unmatched tags remain as text."""
         try:
             return super().render_str(_UNKNOWN_TAG.sub(r"\[", text), **options)
         except MarkupError:
@@ -197,7 +197,7 @@ def ignore_stage(stage: str, fraction: float) -> None:
 
 @contextlib.contextmanager
 def announce_output(what: str, path: Path | None, quiet: bool = False) -> Iterator[None]:
-    """Print before the context that an output is being made (stderr), after it its path (stdout).
+    """Enclose the creation of an output: print a line before it on stderr, and its path after it on stdout.
 
     Args:
         what: name of the output, such as `plot`.

@@ -84,7 +84,7 @@ class IdentificationOptions:
     """Options of the identification.
 
     Attributes:
-        model: `complete`, or `reduced` to the links.
+        model: `complete`, or `reduced` to the links, without the masses of the cylinders.
         pins: whether passive joints and pins have friction.
         asymmetry: whether viscous friction depends on the direction of motion.
         processing: filter and differentiation of the signals.

@@ -4,8 +4,8 @@ The static estimate subtracts the gravity torque, which is linear in a few ident
 from the drive torque (Zhu 1994, 6.1). The dynamic estimate uses the complete model with inertia,
 Coriolis forces, friction and the closed chains of the cylinders.
 
-A fast filter gives positions, rates, accelerations and pressures with equal delay, so that their
-balance holds and friction corresponds to the rate of the same time. The resulting force passes a
+A fast filter gives positions, rates, accelerations and pressures with equal delay, so that the
+force balance between them holds and friction corresponds to the rate of the same time. The result passes a
 slow filter, because the force error from angle noise grows with the fifth power of the frequency.
 
 `EndpointForce` estimates online, `endpoint_force_of_log` from a log. `identify_gravity` identifies
@@ -68,7 +68,8 @@ class GravityModel:
     """Parameters of the static gravity model.
 
     Attributes:
-        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5.
+        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5, where C23 is
+            cos(q2 + q3) and so on.
         value: (p,) parameters [N m].
         ci95_half_width: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
         history: (r, p) parameters after every equation [N m]; empty if computed from masses.
@@ -105,8 +106,9 @@ def gravity_regressor(q: np.ndarray) -> np.ndarray:
 def fit_gravity_to_masses(machine: Machine) -> GravityModel:
     """Fit the static model to the gravity torques of a machine's masses.
 
-    The complete model at rest is fitted over the ranges of the joints. The weight of the links has
-    the form of the static model; that of cylinders and linkages has not and causes `residual`.
+    The complete model at rest is fitted over the ranges of the joints. The gravity torques of
+    the links have the form of the static model. Those of cylinders and linkages do not, which causes the
+    residual torques.
 
     Args:
         machine: machine with an arm whose joints are driven by valves.
@@ -139,7 +141,10 @@ def fit_gravity_to_masses(machine: Machine) -> GravityModel:
 
 @compiled
 def _gravity_torques(arm, poses, torque):
-    """Compute the gravity torques (r, m) [N m] on the m joints of an arm in r poses (r, m) [rad]."""
+    """Compute the gravity torques on the m joints of an arm in r `poses` (r, m) [rad].
+
+    They are written to `torque` (r, m) [N m].
+    """
     outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
         for i in range(len(arm.joint)):
@@ -155,7 +160,8 @@ class SlowMotion(NamedTuple):
     Attributes:
         angle: (r, m) joint angles [rad].
         torque: (r, m) torques of the drives [N m].
-        friction_torque: (r, m) torque per newton of dry friction of the drive [m]; 0 if it may be at rest.
+        friction_torque: (r, m) torque per newton of dry friction of the drive, with the sign of the joint rate
+            [m]; 0 if the drive may be at rest.
     """
 
     angle: np.ndarray
@@ -267,7 +273,8 @@ def _solve_recursively(
         size: number of gravity parameters, which come first; the others are dry friction.
 
     Returns:
-        The estimate, and the gravity parameters (size,) after every instant [N m].
+        The estimator with the final parameters P, and the gravity parameters (size,) after every
+        instant [N m].
     """
     spread = np.append(np.full(size, _INITIAL_GRAVITY_STD), np.full(rows.shape[2] - size, _INITIAL_FRICTION_STD))
     found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
@@ -281,7 +288,8 @@ def _solve_recursively(
 def _are_outliers(residuals: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Return for each instant (r,) whether a residual `residuals` (r, m - 1) is an outlier (Chauvenet's criterion).
 
-    The scale of the residuals is that of the instants that are `kept` (r,).
+    The scale of the residuals is computed only from the instants with `kept` (r,) True, the others having been
+    removed as outliers before.
     """
     from scipy.special import ndtri  # imported here, because runs do not need it
 
@@ -333,7 +341,7 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
         joint: (k,) measured joint positions [rad] or [m].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m].
+        out: (m,) written: force at the tip along r [N], theta [N m], z [N], then attitude and head [N m].
 
     Returns:
         STATUS_WAITING until every channel has a reading, STATUS_GOOD, STATUS_BAD if a reading was not
@@ -599,7 +607,7 @@ def _create_reading_filters(
     motion_bandwidth: float,
     context: str,
 ) -> DriveReadings:
-    """Create the filters of positions, pressures and force, and select the readings that are used.
+    """Create the filters of the force estimator, and find the columns of the readings that it uses.
 
     Args:
         machine: the machine.
@@ -608,6 +616,9 @@ def _create_reading_filters(
         bandwidth: of the force filter [Hz].
         motion_bandwidth: of the filter of positions and pressures [Hz].
         context: name of the caller, for messages.
+
+    Returns:
+        The filters in their initial state, without readings.
     """
     free, valves = (
         independent_axes(machine, context),

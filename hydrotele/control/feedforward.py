@@ -21,15 +21,16 @@ _REFERENCE_CUTOFF_HZ = 8.0  # Hz, cutoff that removes steps and corners of table
 
 
 def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
-    """Compute the drive forces that a plan requires, by inverse dynamics of the model that the servo names.
+    """Compute the drive forces that a plan requires, by inverse dynamics of the machine `servo.force_model`.
 
     Args:
         machine: machine of the scenario, without added effects.
         plan: joint references; all axes must be under feedback.
-        servo: `force_model` names the machine; `lead` [s] compensates for the spool's lag.
+        servo: `force_model` is the name of the machine whose dynamics are used, `nominal` for `machine`;
+            the rates of the forces are advanced by `lead` [s] against the spool's lag.
 
     Returns:
-        The force references, all zero if the servo names no machine.
+        The force references, all zero if `force_model` is None.
 
     Raises:
         InputError: the machine does not exist or has other axes, or an axis has no reference.

@@ -43,8 +43,9 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
     Returns:
         (k, 14): kind (1 hydraulic with valve, 0 force drive), head and rod area [m^2], flow gain
         [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force per command, position
-        gain [1/s], velocity gain (force drives), deadband compensation [1], coefficient of the load
-        filter [1], bulk modulus [Pa], pressure feedback [1/s].
+        gain [1/s], velocity gain (force drives), deadband compensation [1], weight of a new
+        value in the slow mean of the drive force [1], bulk modulus [Pa], feedback of the deviation of the
+        force [1/s].
 
     Raises:
         InputError: a gain is given for an unknown axis.
@@ -76,7 +77,7 @@ class DriveReferences(NamedTuple):
     """References of the drives along a plan, all (n, k).
 
     Attributes:
-        velocity: reference velocity, ahead of time by the servo's lead [m/s] or [rad/s].
+        velocity: reference velocity, that of the time plus the servo's lead [m/s] or [rad/s].
         arm: moment arm d(drive)/d(joint) at the reference.
         volume_head: head chamber volume at the reference [m^3].
         volume_rod: rod chamber volume at the reference [m^3].
@@ -129,8 +130,9 @@ def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> Driv
 def compute_valve_opening(velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain):
     """Compute the valve opening at which a piston moves at a velocity with constant force.
 
-    `A_h p_A' = A_r p_B'` with the orifice flows at the given pressures gives
-    `o = v (A_h^2/V_A + A_r^2/V_B) / (k (A_h/V_A sqrt(dp_in) + A_r/V_B sqrt(dp_out)))`.
+    `A_h p_A' = A_r p_B'`, where ' is d/dt, with the orifice flows at the given pressures gives
+    `o = v (A_h^2/V_A + A_r^2/V_B) / (k (A_h/V_A sqrt(dp_A) + A_r/V_B sqrt(dp_B)))` with the pressure
+    drops dp_A and dp_B of the valve edges at the two chambers.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s], positive extends.
@@ -147,7 +149,7 @@ def compute_valve_opening(velocity, head, rod, supply, tank, area_head, area_rod
     Returns:
         Opening o, scalar [1], not limited.
 
-    Source: chamber and orifice equations of the nominal model, solved for the opening.
+    Source: "Chambers" and "Orifice" of models/cat215/README.md, solved for the opening.
     """
     if velocity > 0.0:
         drop_head, drop_rod = supply - head, rod - tank
@@ -165,7 +167,7 @@ class DriveReference(NamedTuple):
     """References of k drives for one control period, as `interpolate_drive_reference` writes them.
 
     Attributes:
-        velocity: (k,) reference velocity, ahead of time [m/s] or [rad/s].
+        velocity: (k,) reference velocity, that of the time plus the servo's lead [m/s] or [rad/s].
         arm: (k,) moment arm d(drive)/d(joint) at the reference.
         volume_head: (k,) head chamber volume [m^3].
         volume_rod: (k,) rod chamber volume [m^3].
@@ -201,7 +203,7 @@ class ComputedForce(NamedTuple):
     Attributes:
         is_computed: whether they were computed; otherwise the arrays are not used.
         force: (k,) current forces [N] or [N m].
-        rate: (k,) rate of change, ahead of time as the velocity [N/s] or [N m/s].
+        rate: (k,) rates of change, those of the time plus the servo's lead [N/s] or [N m/s].
     """
 
     is_computed: bool
@@ -215,7 +217,7 @@ class ForceReferences(NamedTuple):
     Attributes:
         is_computed: whether they were computed.
         force: forces [N] or [N m]; 0 if not computed.
-        rate: rates of change, ahead of time by the servo's lead [N/s] or [N m/s].
+        rate: rates of change, those of the time plus the servo's lead [N/s] or [N m/s].
     """
 
     is_computed: bool

@@ -179,9 +179,10 @@ class TaskImpedance:
         return reading, rate, change
 
     def _update_coordinate_fit(self, c: int, force: float, position: float, rate: float, acceleration: float) -> None:
-        """Update the impedance of coordinate c with one equation; reset it to 0 without contact.
+        """Update stiffness, damping and mass along coordinate c with one sample; set them to 0 without contact.
 
-        `position`, `rate` and `acceleration` are position, velocity and acceleration.
+        A force of at most `_MIN_CONTACT_FORCE_N` means no contact. The sample gives one equation of the
+        model `F = -(K x + B v + M a + c)`.
         """
         if not abs(force) > _MIN_CONTACT_FORCE_N:
             self._fits[c] = None

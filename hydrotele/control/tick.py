@@ -58,10 +58,10 @@ def control_tick(sim, tick, steps, controller, reference, measured):
     """Compute the servo commands of all axes and simulate the physics of one control tick.
 
     Args:
-        sim: Simulation.
+        sim: Simulation; its state is advanced by one tick.
         tick: control tick, from 0, scalar.
         steps: physics steps per tick, scalar.
-        controller: Controller.
+        controller: Controller; its `command` and `load` are updated.
         reference: TickReference.
         measured: MeasuredState.
 

@@ -65,7 +65,7 @@ class ArmBalance(NamedTuple):
         space: work arrays of the model.
         z: (2 n + 4 h,) state of the model: positions, rates, and four values per valve, of which
             the last two are its pressures [Pa].
-        joint: (m,) independent coordinate of every joint, swing first.
+        joint: (m,) index of the independent coordinate of every joint, swing first.
         task: (9,) of `kinematics.task.arm_parameters`.
         gravity: (p,) parameters of the static model [N m].
         acceleration: (n,) accelerations of the independent coordinates [rad/s^2] or [m/s^2].
@@ -166,9 +166,10 @@ def read_arm_record(r):
 def compute_dynamic_external_forces(arm, external_force):
     """Compute external forces on an arm by the complete model: inertia, gravity, friction, closed chains.
 
-    `tau = B' (M (B a + d) + h + D q') - sum r_i (F_i - f_i(v_i))` with basis B of the independent
-    coordinates, mass matrix M, their accelerations a, drift d, bias forces h, damping D, joint rates
-    q', and moment arms r_i, forces F_i and friction f_i of the drives.
+    `tau = B' (M (B a + d) + h + D q') - sum r_i (F_i - f_i(v_i))` with the accelerations a of the
+    independent coordinates, the basis B (all joint rates per independent rate), and the joint accelerations
+    d at a = 0. M is the mass matrix, h the gravity and velocity forces, D the damping and q' the joint
+    rates. r_i, F_i and f_i(v_i) are moment arm, force and friction of drive i at velocity v_i.
 
     Args:
         arm: ArmBalance; z and acceleration are read.
@@ -227,7 +228,7 @@ def motion_probability(velocity, variance):
     """Return the probability that a drive moves, given its measured velocity.
 
     Rest and motion have equal prior probability. The velocity of a moving drive is uniform over a
-    range of _VELOCITY_RANGE_RATIO sqrt(2 pi) times the noise.
+    range of 8 sqrt(2 pi) standard deviations of the noise.
 
     Args:
         velocity: measured velocity, scalar [m/s] or [rad/s].
@@ -250,8 +251,8 @@ def motion_probability(velocity, variance):
 def _subtract_drive_forces(arm, with_friction, external_force):
     """Subtract the forces of the hydraulic drives from the external forces (n,), through their moment arms.
 
-    With `with_friction`, the friction is subtracted from a drive's force, weighted by the probability
-    that the drive moves.
+    With `with_friction`, the force of a drive is first reduced by its friction times the probability that
+    it moves.
     """
     model, sp, n = arm.model, arm.space, len(external_force)
     for i in range(model.hydraulic):
@@ -272,14 +273,14 @@ def joint_gravity_torque(q, joint, gravity, i):
     """Return the gravity torque on a joint of the arm, by the static model.
 
     Each link from the boom outwards has two parameters, for the cosine and the sine of its
-    attitude, which act on all joints before it. The seventh parameter belongs to the head of a
+    attitude, which act on its own joint and on all joints before it. The seventh parameter belongs to the head of a
     feller-buncher.
 
     Args:
         q: (>= n,) positions of the independent coordinates [rad].
-        joint: (m,) independent coordinate of every joint, swing first.
+        joint: (m,) index of the independent coordinate of every joint, swing first.
         gravity: (2 (m - 1),) parameters of 3 or 4 joints, (7,) of 5: C2, S2, C23, S23, C234,
-            S234 and C5 [N m].
+            S234 and C5 [N m], where C23 is the factor of cos(q2 + q3) and so on.
         i: index of the joint.
 
     Returns:
@@ -309,7 +310,7 @@ def solve_tip_force(arm, external_force, out):
     Args:
         arm: ArmBalance; z is read, table and work are overwritten.
         external_force: (n,) external forces on the independent coordinates [N m] or [N].
-        out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; unchanged if the
+        out: (m,) written: force along r [N], theta [N m], z [N], then attitude and head [N m]; unchanged if the
             Jacobian is singular.
 
     Returns:

@@ -52,7 +52,8 @@ class CodeCache(NullCache):
     Args:
         function: the Python function.
         folder: folder of the cache of its module; None if no folder is usable.
-        form: distinguishes several forms of compiled code of the function.
+        form: kind of compiled code, since a function may be compiled for calls from Python, from compiled
+            functions and from C.
     """
 
     def __init__(self, function, folder: Path | None, form: str) -> None:

@@ -161,7 +161,7 @@ def _function_cache(function, form: str) -> NullCache:
 
     Args:
         function: the Python function.
-        form: name of the form of code: "python", "called" or "callback".
+        form: callers of the code: "python", "called" for compiled functions, or "callback" for C.
     """
     if _read_source(function.__module__) is None:
         return NullCache()
@@ -230,8 +230,8 @@ def _find_imports(module: str) -> frozenset[str]:
 def source_digest(module: str) -> str:
     """Return a hash of the sources of a module, of its direct and indirect imports and of this module.
 
-    A change of any of these sources selects another cache folder. This module is always included,
-    since a module whose functions another one compiles need not import it.
+    The hash is a part of the name of the cache folder, so that a changed source selects another folder.
+    This module is always included, because it determines how all functions are compiled.
     """
     open_ones = [module, __name__]
     reached = set(open_ones)

@@ -72,7 +72,7 @@ class Callee:
         return self._symbol_key(result)
 
     def _symbol_key(self, result: Any) -> tuple[str, str]:
-        """Register a function's symbol with numba and return its key."""
+        """Make a compiled function's symbol known to numba's code generator, and return the key of the symbol."""
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)

@@ -101,7 +101,7 @@ class MjcfDocument:
             return mujoco.MjSpec.from_string(self.text, include=self.model_texts())
 
     def compile(self, spec: mujoco.MjSpec) -> mujoco.MjModel:
-        """Compile the spec of `load_spec`, changed or not.
+        """Compile a MuJoCo spec of this document, which may have been changed since `load_spec`, to a model.
 
         Raises:
             InputError: MuJoCo refuses it; names file and line where MuJoCo states one.
@@ -114,7 +114,7 @@ class MjcfDocument:
         return {name: model.text.encode() for name, model in self.models.items()}
 
     def find_origin(self, line: int) -> tuple[Path, int] | None:
-        """Return file and line of the user's element that a line of `text` contains.
+        """Return file and line in the user's files of the element at a line of `text`.
 
         It is the last element that starts on or before that line; None if there is none.
         """
@@ -147,7 +147,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
 
 @contextlib.contextmanager
 def translate_mujoco_errors(where: object, document: MjcfDocument | None = None) -> Iterator[None]:
-    """Context in which an error of MuJoCo becomes an InputError with one sentence.
+    """Convert errors that MuJoCo raises in the context to an InputError with one sentence.
 
     Args:
         where: location for the message.
@@ -443,7 +443,7 @@ def _count_elements(
     most_values: dict[Element, float] = {}
 
     def locate_largest_element(amounts: Mapping[Element, float]) -> str:
-        """Return file, line and tag of the element with the largest amount, as text."""
+        """Return file, line and tag of the element with the largest number of copies or values, as text."""
         element = max(amounts, key=lambda element: amounts[element])
         file, line = origins.get(element, (path, 0))
         return f"{file}:{line}: <{element.tag}>"

@@ -52,7 +52,7 @@ def atomic_folder(target: str | Path, kind: str) -> Iterator[Path]:
 
     Args:
         target: folder to create; an existing folder of the same kind is replaced.
-        kind: a key of `OUTPUT_FILES`.
+        kind: kind of output, such as `run`; a key of `OUTPUT_FILES`, which lists its files.
 
     Yields:
         The temporary folder to write to. A killed run leaves only `.NAME.*.part`, which the next
@@ -97,7 +97,7 @@ def check_output_folder(target: str | Path, kind: str) -> None:
 
     Args:
         target: the folder to be written.
-        kind: a key of `OUTPUT_FILES`.
+        kind: kind of output, such as `run`; a key of `OUTPUT_FILES`, which lists its files.
 
     Raises:
         InputError: the target is a file, a folder of another kind, a folder with unknown files, or

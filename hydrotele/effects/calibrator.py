@@ -28,9 +28,10 @@ def _with_sensor_error(machine: Machine, joint: str, **numbers: float) -> Machin
 
 
 def _bending_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the angular compliance of a link across a joint's axis.
+    """Return nominal value, bounds and prior of a link's bending compliance, the bending angle per torque.
 
-    One degree of bending by 200 N m, the weight torque of an extended calibrator, is 9e-5 rad/(N m).
+    The torque acts perpendicular to the axis of the link's joint. For comparison, one degree of bending
+    by 200 N m, the weight torque of an extended calibrator, is 9e-5 rad/(N m).
     """
     present = machine.joints[joint].bending
     high = max(5.0e-4, present)
@@ -44,8 +45,8 @@ def _set_bending(machine: Machine, joint: str, values: Values) -> Machine:
 def _sensor_misalignment_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the tilt between a joint and its angle sensor.
 
-    Couplings are aligned to a few degrees. A tilt of 3 degrees causes an angle error with an
-    amplitude of 0.04 degrees and two periods per revolution.
+    Couplings are aligned to a few degrees. The smallest relevant tilt is 3 degrees. It causes an angle
+    error with an amplitude of 0.04 degrees and two periods per revolution of the joint.
     """
     one = math.radians(1.0)
     present = _sensor_error(machine, joint).tilt
@@ -60,7 +61,8 @@ def _set_sensor_misalignment(machine: Machine, joint: str, values: Values) -> Ma
 def _sensor_backlash_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the backlash between a joint and its angle sensor.
 
-    A loose coupling has some tenths of a degree; the resolver resolves one tenth.
+    A loose coupling has a backlash of some tenths of a degree. The smallest relevant backlash is a
+    tenth of a degree, the resolution of the sensor.
     """
     one = math.radians(1.0)
     present = _sensor_error(machine, joint).backlash

@@ -26,8 +26,8 @@ _MIN_BULK_MODULUS_PA = 1.0e7  # Pa, oil full of air: the smallest bulk modulus t
 def _internal_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the leakage coefficient between a drive's chambers.
 
-    Bounds and prior are proportional to the rated flow divided by the highest pressure. A good seal
-    leaks 1 % of the rated flow at full pressure.
+    Bounds and prior are fractions of the rated flow divided by the highest pressure. The smallest
+    relevant change is 0.5 %; a good seal leaks about 1 % of the rated flow at full pressure.
     """
     whole = machine.axes[location].rated_flow / machine.max_feed_pressure(location)
     present = machine.axes[location].hydraulic_drive.leakage
@@ -38,9 +38,8 @@ def _internal_leakage_parameters(machine: Machine, location: str) -> dict[str, P
 def _tank_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of a spool's leakage coefficient from work port to tank.
 
-    Bounds and prior are proportional to the rated flow divided by the highest pressure. By
-    `laws.chamber_flows`, 0.01 % of it corresponds to a 25 mm spool with 7 um of radial clearance, 0.05 %
-    to 12 um, and 0.5 % to 26 um.
+    Bounds and prior are fractions of the rated flow divided by the highest pressure. The smallest
+    relevant change is 0.05 %, the leakage of a 25 mm spool with a radial clearance of 12 um.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -85,7 +84,7 @@ def _oil_effect_locations(machine: Machine) -> tuple[str, ...]:
 def _bulk_modulus_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the bulk modulus of the oil.
 
-    Entrained air reduces it by tens of per cent; a pressure change of 1 MPa changes it by 5 %.
+    Entrained air reduces it by tens of per cent. The smallest relevant change is 5 %.
     """
     assert machine.supply
     present = machine.supply.bulk_modulus
@@ -101,7 +100,8 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 def _entrained_air_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the volume fraction of air in the oil.
 
-    Oil of a working machine carries 0.5 to 5 %; 0.2 % is hardly measurable above 2 MPa.
+    The oil of a working machine contains 0.5 to 5 %. The smallest relevant fraction is 0.2 %, which is
+    hardly measurable at pressures above 2 MPa.
     """
     assert machine.supply
     present = machine.supply.entrained_air
@@ -144,7 +144,8 @@ NAME = "orifice_leakage"
 def _sqrt_relief_pressure(machine: Machine) -> float:
     """Return the square root of the relief pressure [sqrt(Pa)].
 
-    The parameter of turbulent leakage is the flow at this pressure; flow over root is the law's gain.
+    Turbulent leakage is gain times root of pressure difference. With this root, the gain is converted to
+    and from the effect's parameter, the flow at relief pressure.
     """
     assert machine.supply
     return math.sqrt(machine.supply.relief_pressure)

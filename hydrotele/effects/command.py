@@ -79,7 +79,8 @@ def _set_offset(machine: Machine, location: str, values: Values) -> Machine:
 def _axes_without_own_pump(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes for which an offset of the command can be simulated.
 
-    Axes with an own pump are excluded, because at command 0 their switching valve is closed.
+    Axes that are driven by an own pump are excluded. There, command 0 closes a switching valve, which any
+    offset would keep open.
     """
     return tuple(name for name, axis in machine.axes.items() if not axis.pump)
 

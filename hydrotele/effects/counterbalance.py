@@ -14,9 +14,9 @@ _TYPICAL_DROP_RATIO = 0.5  # of the relief pressure: drop at which a compensator
 
 
 def _max_inlet_drop(machine: Machine, location: str) -> float:
-    """Return the largest pressure drop across the inlet edge of a valve [Pa].
+    """Return the largest pressure drop from pump to drive across a valve's spool [Pa].
 
-    It is the drop that a pressure compensator holds, otherwise the relief pressure.
+    With a pressure compensator it is the drop that the compensator holds, otherwise the relief pressure.
     """
     valve = machine.axes[location].valve
     assert valve and machine.supply
@@ -28,8 +28,8 @@ def _compensator_parameters(machine: Machine, location: str) -> dict[str, Parame
     """Return nominal value, bounds and prior of the effect of a pressure compensator.
 
     The parameter is the fraction of the relief pressure that the compensator absorbs; 0 means no
-    compensator. Usual are 90 to 98 % (estimate). A fraction of 0.1 affects only an unloaded arm at full
-    supply pressure.
+    compensator. Usual are 0.9 to 0.98 (estimate). The smallest relevant fraction is 0.1, which has an
+    effect only at low load and full supply pressure.
     """
     assert machine.supply
     present = 1.0 - _max_inlet_drop(machine, location) / machine.supply.relief_pressure
@@ -78,8 +78,8 @@ def _installed_valve(machine: Machine, location: str) -> Counterbalance | None:
 def _counterbalance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of a counterbalance valve's setting; 0 means no valve.
 
-    Valves are set to 1.3 times the load pressure, at most to the port relief pressure. With the
-    usual pilot ratio, a tank line at 0.5 MPa opens a valve at the smallest relevant setting.
+    The setting is the pressure of the chamber at which the valve opens without pilot pressure. Usually
+    it is 1.3 times the load pressure. Bounds and prior are fractions of the supply's relief pressure.
     """
     assert machine.supply
     relief = machine.supply.relief_pressure

@@ -33,7 +33,7 @@ class Parameter:
         start_values: start values of a search, for effects that vanish at the nominal value or whose
             gradient there is not informative; empty if nominal is a good start value.
         optional: whether the parameter may be omitted when the effect is added to a machine.
-            Screening of many effects omits it, too. An omitted parameter is nominal.
+            A search that screens many effects omits it, too. An omitted parameter has its nominal value.
     """
 
     unit: str
@@ -171,8 +171,8 @@ def speed_unit(machine: Machine, axis: str) -> str:
 def max_drive_force(machine: Machine, axis: str) -> float:
     """Return the largest force or torque of a drive [N] or [N m].
 
-    For a hydraulic drive it is the highest feed pressure times the head area; for a force drive the
-    force at full command.
+    For a cylinder it is the highest feed pressure times the head area, and for a hydraulic motor that
+    pressure times the displacement per radian. For a force drive it is the force at full command.
     """
     facts = machine.axes[axis]
     if facts.force:

@@ -50,7 +50,8 @@ def _pulse_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of amplitude, start and duration of a force pulse.
 
     The smallest relevant amplitude is three times that of a constant force, so that a pulse of one
-    second is detectable. Without a pulse, start and duration are 5 s, as start values of a search.
+    second is detectable. If the machine has no pulse, a search begins with the nominal start and duration
+    of 5 s.
     """
 
     def present_value(parameter: str, absent: float) -> float:

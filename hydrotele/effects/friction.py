@@ -29,12 +29,12 @@ from hydrotele.terms.law import Term
 def _make_friction_parameters(field: str, scale: float, high: float):
     """Return a function (machine, location) -> nominal value, bounds and prior of a friction parameter.
 
-    The smallest relevant change is the larger of two values. A thousandth of the drive's largest force
-    is 20 to 30 kPa on the piston, the error of a good transducer. A tenth of the given friction is the
-    change by warm oil within a working shift.
+    The smallest relevant change is the larger of two values: a thousandth of the drive's largest force
+    (error of a good pressure transducer), and a tenth of the given friction (change by warm oil).
 
     Args:
-        field: field of the machine's friction: `coulomb`, `viscous` or `stribeck_extra`.
+        field: field of the machine's friction: `coulomb`, `viscous`, or `stribeck_extra`, the additional
+            friction at low speed.
         scale: smallest standard deviation of the prior as a fraction of the drive's largest force [1]; for
             viscous friction that force is divided by the typical speed.
         high: largest increase as a fraction of the same force [1].
@@ -73,7 +73,7 @@ def _friction_axes(machine: Machine) -> tuple[str, ...]:
 def _asymmetry_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of the direction dependence of a drive's friction.
 
-    There is one asymmetry for dry and one for viscous friction, each only if the drive has such
+    There is one relative asymmetry for dry and one for viscous friction, each only if the drive has such
     friction. The friction of lip seals differs by tens of per cent between the directions.
     """
     friction = machine.axes[location].drive.friction
@@ -143,8 +143,8 @@ def _position_range(machine: Machine, location: str) -> tuple[float, float]:
 def _bump_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of additional dry friction at one position of a drive.
 
-    The parameters are its height (as for Coulomb friction), centre and width. A bent rod or a worn
-    tooth spans a tenth of the travel.
+    The parameters are its height (a friction force), centre and width. The nominal width is a tenth of
+    the travel, as for a bent rod or a worn tooth.
     """
 
     def present_value(parameter: str, absent: float) -> float:

@@ -158,7 +158,7 @@ def _base_tilt_locations(machine: Machine) -> tuple[str, ...]:
 def _base_tilt_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values (0), bounds and priors of roll and pitch of the machine's base.
 
-    Ground is level to a few degrees. The smallest relevant angle is 3 mrad, as a spirit level resolves.
+    Ground is level to a few degrees. The smallest relevant angle is 3 mrad, which a spirit level resolves.
     """
     tilt = Parameter("rad", 0.0, -0.2, 0.2, 0.03, 0.003)
     return {"roll": tilt, "pitch": tilt}

@@ -31,10 +31,10 @@ def _is_vertical_base_axis(machine: Machine, axis: str) -> bool:
 def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values (0), bounds and priors of the offsets of a link's centre of mass.
 
-    They are fractions of the size of the link. An offset parallel to the joint axis is omitted, because it does not
-    change the motion of the joint. An offset of 0.5 % of a boom, about 25 mm, changes its
-    pressure by 40 kPa. For a vertical axis only the moment of inertia changes, so that the smallest
-    relevant offset is six times larger.
+    Bounds and priors are fractions of the size of the link. An offset parallel to the joint axis is
+    omitted, because it does not change the motion of the joint. The smallest relevant offset is 0.5 %,
+    about 25 mm of a boom, which changes the pressure in its cylinder by 40 kPa. It is six times larger
+    for a vertical axis, where weight causes no torque.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
     least = (0.03 if _is_vertical_base_axis(machine, location) else 0.005) * size
@@ -53,8 +53,8 @@ def _move_com(machine: Machine, location: str, values: Values) -> Machine:
 def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (1), bounds and prior of the ratio of true to given moments of inertia.
 
-    A model from drawings is accurate to about 20 %, with typical rounding of 5 %. The bounds
-    include attachments, ballast, and a wrong unit in the drawings.
+    A model from drawings is accurate to about 20 %. The smallest relevant change is 5 %, a typical
+    rounding. The bounds include attachments, ballast, and a wrong unit in the drawings.
     """
     return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, start_values=(1.0, 6.0))}
 
@@ -92,8 +92,8 @@ def _payload_locations(machine: Machine) -> tuple[str, ...]:
 def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (0), bounds and prior of the mass of a payload at the arm's tip.
 
-    They are fractions of the mass that the boom joint moves. Seal friction hides a payload below 15 kg
-    at a moved mass of 2.5 t.
+    Bounds and prior are fractions of the mass that the boom joint moves. The smallest relevant payload
+    is 0.6 % of it, 15 kg of 2.5 t; seal friction hides smaller ones.
     """
     assert machine.arm
     arm = outboard_links(machine, machine.link_of(machine.arm.boom))

@@ -2,7 +2,8 @@
 
 Most effects change one parameter, so that a search for wrong parameters can name it. Bounds and
 priors of catalogue parameters are fractions of their values. For losses that catalogues omit, they are
-fractions of the motor's stall torque or the pump's rated flow.
+fractions of the motor's stall torque or the pump's rated flow. A load cylinder resists the
+extension of a drive, because its oil leaves through a relief valve.
 """
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_value
@@ -55,7 +56,8 @@ def _proportional_parameter(unit: str, present: float, scale: float, least: floa
 def _displacement_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the displacement of an axis pump.
 
-    Gear pumps of one size scatter by some per cent; a flow meter resolves 1 %.
+    Gear pumps of one size differ by some per cent. The smallest relevant change is 1 %, which a flow
+    meter resolves.
     """
     present = _get_axis_pump(machine, location).displacement
     return {"displacement": _proportional_parameter("m^3/rad", present, 0.1, 0.01, 3.0)}
@@ -64,7 +66,8 @@ def _displacement_parameters(machine: Machine, location: str) -> dict[str, Param
 def _pump_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the leakage coefficient of an axis pump.
 
-    They are fractions of the rated flow over the highest pressure: 10 % is typical, 1 % detectable.
+    Bounds and prior are fractions of the rated flow divided by the highest pressure. A change of 10 %
+    of that ratio is typical, and 1 % is the smallest relevant one.
     """
     pump = _get_axis_pump(machine, location)
     whole = pump.rated_flow / machine.max_feed_pressure(location)
@@ -76,7 +79,8 @@ def _pump_leakage_parameters(machine: Machine, location: str) -> dict[str, Param
 def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the torque loss of an axis pump, relative to its torque.
 
-    Small gear pumps lose 10 to 60 % of their torque; warm oil changes the loss by 3 %.
+    Small gear pumps lose 10 to 60 % of their torque. The smallest relevant change is 3 % of the torque,
+    as caused by warm oil.
     """
     present = _get_axis_pump(machine, location).torque_loss
     return {"torque_loss": Parameter("1", present, 0.0, max(2.0, present), 0.2, 0.03)}
@@ -85,7 +89,7 @@ def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the torque constant of a pump motor.
 
-    Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
+    The constant of equal motors differs by 10 %. The smallest relevant change is 2 %, as caused by heating.
     """
     present = _get_pump_motor(machine, location).torque_constant
     return {"torque_constant": _proportional_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
@@ -94,7 +98,8 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
 def _motor_inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the common inertia of motor and pump.
 
-    It is known to tens of per cent; a wrong unit causes errors of powers of ten.
+    It is usually known to tens of per cent. The bounds, a thirtieth and thirty times the given value,
+    include a wrong unit.
     """
     present = _get_pump_motor(machine, location).inertia
     return {"inertia": _proportional_parameter("kg m^2", present, 0.3, 0.05, 30.0)}
@@ -108,7 +113,7 @@ def _stall_torque(machine: Machine, location: str) -> float:
 def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of dry drag and breakaway torque of motor and pump.
 
-    They are fractions of the stall torque, of which brushes and seals cause 5 %.
+    Bounds and priors are fractions of the motor's stall torque. Brushes and seals typically cause 5 % of it.
     """
     motor, whole = _get_pump_motor(machine, location), _stall_torque(machine, location)
     return {
@@ -120,7 +125,7 @@ def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Paramet
 def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the viscous drag of motor and pump.
 
-    They are the same fractions as for dry drag, here of stall torque over rated speed.
+    Bounds and prior are the same fractions as for dry drag, here of the stall torque over the rated speed.
     """
     present = _get_pump_motor(machine, location).viscous
     whole = _stall_torque(machine, location) / _get_axis_pump(machine, location).rated_speed
@@ -133,11 +138,11 @@ def _line_locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal values, bounds and priors of compliance and air volume of a line.
+    """Return nominal values, bounds and priors of compliance and air volume of a hose between pump and drive.
 
-    They are proportional to compliance and volume of the oil at mid-stroke. Hoses are several times more
-    compliant than their oil. The air volume is stated at atmospheric pressure; a few per cent of the oil
-    volume are typical.
+    Bounds and priors are proportional to compliance and volume of the oil at mid-stroke. A hose is
+    typically several times more compliant than its oil. The air volume is stated at atmospheric
+    pressure; a few per cent of the oil volume are typical.
     """
     axis, _, side = location.partition(".")
     drive, pump = machine.axes[axis].cylinder, _get_axis_pump(machine, axis)
@@ -161,7 +166,8 @@ def _set_lines(machine: Machine, location: str, values: Values) -> Machine:
 def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the charge pressure of an axis' accumulator.
 
-    It is set manually to tens of per cent; the finest mark of a gauge is 2 %.
+    It is set manually with an error of tens of per cent. The smallest relevant change is 2 %, the finest
+    mark of a gauge.
     """
     present = _get_axis_pump(machine, location).accumulator.pressure
     return {"pressure": _proportional_parameter("Pa", present, 0.2, 0.02, 5.0)}
@@ -170,7 +176,8 @@ def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the relief pressure of a load cylinder.
 
-    Low settings are made manually to tens of per cent; the finest mark of a gauge is 2 %.
+    It is set manually with an error of tens of per cent. The smallest relevant change is 2 %, the finest
+    mark of a gauge.
     """
     present = machine.loads[location].relief_pressure
     return {"relief_pressure": Parameter("Pa", present, 0.0, 3.0 * present, 0.2 * present,
@@ -178,9 +185,9 @@ def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the packing friction of a load cylinder.
+    """Return nominal value, bounds and prior of the seal friction of a load cylinder.
 
-    It is stated as a fraction of the load's force; packings cause up to some tens of per cent.
+    It is stated as a fraction of the load's force. Seals cause up to some tens of per cent.
     """
     present = machine.loads[location].friction
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}

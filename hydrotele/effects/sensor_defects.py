@@ -35,8 +35,9 @@ def _with_sensor_error(machine: Machine, channel: str, **numbers: float) -> Mach
 def _angle_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the offset of a position sensor.
 
-    Resolvers are mounted to half a degree or worse and resolve a twentieth of a degree. Slides use
-    corresponding fractions of their range.
+    Angle sensors are mounted with errors of half a degree or more. The smallest relevant offset is a
+    twentieth of a degree, their resolution. For sliding joints, bounds and prior are fractions of the
+    joint's range.
     """
     present = _sensor_error(machine, _position_channel(machine, location)).offset
     if machine.position_kind(location) == "angle":
@@ -59,7 +60,7 @@ def _make_position_error_setter(field: str, parameter: str):
 def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of drift and warm-up time constant of a position sensor.
 
-    The drift is the offset that the warm sensor has gained; it has the bounds and prior of an offset.
+    The drift is the additional offset of the warm sensor, with the bounds and prior of an offset.
     """
     error = _sensor_error(machine, _position_channel(machine, location))
     sizes = _angle_offset_parameters(machine, location)["offset"]
@@ -85,8 +86,8 @@ def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine
 def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the scale factor of a position sensor.
 
-    It is wrong with a wrong gear or reference voltage. The linearity of a resolver is 0.3 % over
-    one radian.
+    It differs from 1 with a wrong gear or reference voltage. The smallest relevant change is 0.3 %, the
+    linearity of an angle sensor over one radian.
     """
     present = _sensor_error(machine, _position_channel(machine, location)).scale
     low, high = min(0.8, present), max(1.2, present)
@@ -96,7 +97,7 @@ def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _sensor_delay_parameters(present: float) -> dict[str, Parameter]:
     """Return nominal value (`present` [s]), bounds and prior of a sensor delay.
 
-    Filters and buses delay by about 10 ms; 3 ms is one bus cycle.
+    Filters and buses delay by about 10 ms. The smallest relevant change is 3 ms, one bus cycle.
     """
     high = max(0.3, present)
     return {"delay": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.02, 0.06))}
@@ -109,7 +110,7 @@ def _angle_delay_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _sensor_lag_parameters(present: float) -> dict[str, Parameter]:
     """Return nominal value (`present` [s]), bounds and prior of the first-order time constant of a sensor.
 
-    Transducers and their filters have 1 to 50 ms.
+    Sensors and their filters have time constants of 1 to 50 ms.
     """
     high = max(0.3, present)
     return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.01, 0.04))}
@@ -122,8 +123,8 @@ def _angle_lag_parameters(machine: Machine, location: str) -> dict[str, Paramete
 def _length_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the offset of a cylinder's length sensor.
 
-    They are fractions of the stroke. Length sensors are mounted to a centimetre; the smallest relevant
-    offset is a millimetre.
+    Bounds and prior are fractions of the stroke. For a stroke of 1 m, length sensors are mounted with an
+    error of a centimetre, and the smallest relevant offset is a millimetre.
     """
     cylinder = machine.axes[location].cylinder
     assert cylinder
@@ -148,7 +149,8 @@ def _pressure_channel_of_location(location: str) -> str:
 def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the zero offset of a pressure transducer.
 
-    The accuracy class is 0.5 % of the span, the repeatability better than 0.1 %.
+    The typical offset is 0.5 % of the span, the accuracy class. The smallest relevant change is 0.07 %,
+    since the repeatability is better than 0.1 %.
     """
     present = _sensor_error(machine, _pressure_channel_of_location(location)).offset
     span = machine.max_feed_pressure(location.rpartition(".")[0])
@@ -163,8 +165,8 @@ def _set_pressure_offset(machine: Machine, location: str, values: Values) -> Mac
 def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the scale factor of a pressure transducer.
 
-    It is wrong with a wrong span setting or supply voltage. A calibrated transducer is accurate to
-    0.25 %.
+    It differs from 1 with a wrong span setting or supply voltage. The smallest relevant change is 0.3 %,
+    about the accuracy of a calibrated transducer.
     """
     present = _sensor_error(machine, _pressure_channel_of_location(location)).scale
     low, high = min(0.8, present), max(1.2, present)
@@ -241,9 +243,9 @@ def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
 def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the time by which a group of sensors is recorded late.
 
-    The time is relative to commands and other sensors. A group is never early, because that would be a
-    response before its command. Between the two groups either sign is possible, as an offset of one or
-    the other. Loggers are off by about 10 ms.
+    The time is relative to commands and other sensors, and is never negative, because that would be a
+    response before its command. If one group is early relative to the other one, the other one is late.
+    Typical offsets are about 10 ms.
     """
     present = _common_delay_or_lag(machine, _clock_groups(machine)[location], "delay")
     high = max(0.5, present)

@@ -31,7 +31,8 @@ def _pump_flow_parameters(machine: Machine, location: str) -> dict[str, Paramete
 def _droop_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the decrease of pump flow per pressure.
 
-    Leakage and engine governor reduce the flow by 5 % at full pressure; a new pump loses 1 %.
+    Leakage and engine governor typically reduce the flow by 5 % at full pressure. The smallest relevant
+    decrease is 1 %, that of a new pump.
     """
     assert machine.supply
     whole = machine.supply.pump_flow / machine.supply.relief_pressure
@@ -47,7 +48,8 @@ def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
 def _pump_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the first-order time constant of the pump flow.
 
-    Swash plates respond in 50 to 300 ms, fast ones in 20 ms.
+    The swash plate of a pump responds in 50 to 300 ms. The smallest relevant change is 20 ms, the time
+    constant of a fast one.
     """
     assert machine.supply
     present = machine.supply.time_constant
@@ -59,8 +61,8 @@ def _relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of pressure and override of the main relief valve.
 
     The override is the pressure rise per flow through the open valve; only a pump of constant flow has
-    it as a parameter. The pressure is set manually to a few per cent; the finest mark of a gauge is
-    0.3 %. Up to full pump flow the pressure rises by about 10 %, for a pilot-operated valve by 1 %.
+    it as a parameter. The smallest relevant change of the pressure is 0.3 %, the finest mark of a gauge.
+    The pressure typically rises by 10 % up to full pump flow; the smallest relevant rise is 1 %.
     """
     supply = machine.supply
     assert supply

@@ -57,7 +57,7 @@ def spring_damping(inertia: float, stiffness: float) -> float:
 def raise_to_resolvable_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
     """Return the drive-side inertia, increased if steps of 1 ms could not resolve its vibration.
 
-    The result is at least (spring + oil stiffness) / w^2 with w = 2 pi 150 rad/s.
+    The result is large enough that the inertia vibrates on spring and oil at 150 Hz or less.
 
     Args:
         machine: the machine.
@@ -166,11 +166,10 @@ def _backlash_axes(machine: Machine) -> tuple[str, ...]:
 def _backlash_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of the backlash between a motor and its load.
 
-    The parameters are backlash, drive-side inertia, damping ratio and contact frequency, the natural
-    frequency of the drive on closed teeth. A worn slewing ring has half a degree of backlash, a new one
-    1 mrad, which is also the resolution of a resolver. Drive inertia and contact frequency are known
-    only to a factor; they matter only for chatter resolved sample by sample. Steel teeth vibrate at 30
-    to 100 Hz. Faster contact of oil and teeth cannot be simulated with 1 ms steps.
+    The parameters are backlash, drive-side inertia, damping ratio and contact frequency. The latter is
+    the natural frequency at which the drive vibrates while its teeth touch, 30 to 100 Hz for steel. A
+    worn slewing ring has half a degree of backlash, a new one 1 mrad, the smallest relevant change.
+    All parameters but the backlash are optional, because they are known only roughly.
     """
     drive = _transmission_or_default(machine, location)
     present, rings = drive.backlash, _spring_frequency(drive)
@@ -259,10 +258,10 @@ def _typical_deflection(machine: Machine, location: str) -> float:
 def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of the compliance between a drive and its load.
 
-    The parameters are compliance, drive-side inertia and damping ratio. The smallest relevant deflection
-    at full pressure is 2 mm for a stroke of 1 m, or 2 mrad. Inertia and damping are known only to a
-    factor. The inertia is never below the value that the oil alone needs for 1 ms steps; a stiff spring
-    may need more than the stated inertia.
+    The parameters are compliance, drive-side inertia and damping ratio. The smallest relevant compliance
+    deflects by 1.5 mm per metre of stroke, or by about 2 mrad, at full force. Inertia and damping are
+    optional, because they are known only roughly. The inertia has a lower bound, below which the
+    simulation with 1 ms steps would not resolve the vibration.
     """
     usual = _typical_deflection(machine, location) / max_drive_force(machine, location)
     transmission = machine.axes[location].transmission
@@ -287,7 +286,8 @@ def _set_flexibility(machine: Machine, location: str, values: Values) -> Machine
 
     An existing backlash is kept. A cylinder's spring is in line with it, between piston and rod pin, so
     that length sensor and oil follow the piston. The drive-side inertia is the stated value, otherwise
-    the rod's mass or 3 % of a motor's load. It is increased if a stiff spring needs it for 1 ms steps.
+    the rod's mass or 3 % of a motor's load inertia. It is increased if 1 ms steps could not resolve its
+    vibration on the spring.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
     table = _flexibility_parameters(machine, location)

@@ -44,8 +44,8 @@ def _set_deadband(machine: Machine, location: str, values: Values) -> Machine:
 def _gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (1), bounds and prior of the ratio of true to given flow gain of a valve.
 
-    A manufacturer's flow rating is accurate to 5 or 10 %, the linearity of a spool is 2 %. The
-    bounds include a different spool in the same body.
+    A manufacturer's flow rating is accurate to 5 or 10 %. The smallest relevant change is 2 %, the
+    linearity of a spool. The bounds include a different spool in the same body.
     """
     return {"ratio": Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02)}
 
@@ -58,8 +58,8 @@ def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
 def _bandwidth_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the bandwidth of a valve's spool.
 
-    The smallest relevant deviation is 8 %. At 8 Hz it changes the lag by 3 ms, the smallest
-    relevant delay.
+    The smallest relevant change is 8 %. For a bandwidth of 8 Hz it changes the lag of the spool by 3 ms,
+    the smallest relevant change of a delay.
     """
     w = _get_axis_valve(machine, location).bandwidth
     return {"bandwidth": Parameter("rad/s", w, 0.1 * w, 4.0 * w, 0.4 * w, 0.08 * w)}
@@ -103,9 +103,9 @@ DIRECTIONS = ("positive", "negative")
 
 
 def _direction_gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return the ratio of true to given flow gain for each direction of a valve.
+    """Return nominal value (1), bounds and prior of the ratio of true to given flow gain per direction.
 
-    Nominal value (1), bounds and prior are those of the ratio common to both directions.
+    They are the same numbers as for a ratio that is common to both directions of the valve.
     """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02))
 
@@ -159,8 +159,8 @@ def _flow_curve_parameters(machine: Machine, location: str) -> dict[str, Paramet
     """Return nominal value (0), bounds and prior of the flow curve's progression for each direction.
 
     The progression says how much less a valve opens over its first travel than a linear one; see
-    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Estimates: spools for fine control
-    reach 0.6, notches cause 0.04.
+    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Spools for fine control reach 0.6; the
+    smallest relevant progression is 0.04, as caused by notches (estimates).
     """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
@@ -210,8 +210,9 @@ EDGE_FIELDS = {
 def _metering_edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the relative gain of each metering edge of a valve.
 
-    The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. Estimates:
-    spools for single-rod cylinders differ by tens of per cent; a notch changes 3 %.
+    The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. In spools for
+    single-rod cylinders the gains differ by tens of per cent. The smallest relevant change is 3 %, as
+    caused by a notch (estimates).
     """
     valve = machine.axes[location].valve
     assert valve

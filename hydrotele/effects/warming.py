@@ -28,7 +28,7 @@ def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]
     """Return nominal values, bounds and priors of the viscosity change by warming during a run.
 
     The parameters are the ratio of final to initial viscosity and the time constant. Warming by 20 K
-    halves the viscosity; a change of 5 % corresponds to 2 K.
+    halves the viscosity. The smallest relevant change is 5 %, which corresponds to 2 K.
     """
     term = next((term for term in machine.terms if term.name == NAME), None)
     present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _WARMING_TIME_S}

@@ -132,7 +132,7 @@ class MachineEnvironment(dm_env.Environment):
         return 1.0 / self.core.setup.options.control_rate
 
     def last_info(self) -> dict[str, Any]:
-        """Return the `info` of the last step: task measures, variant and fault."""
+        """Return the `info` of the last step: task measures, machine variant, and whether the simulation failed."""
         return {name: values[0] for name, values in make_info(self.core).items()}
 
     def render(self, height: int = 240, width: int = 320, camera_id: Camera = FREE_CAMERA) -> np.ndarray:

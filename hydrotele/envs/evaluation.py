@@ -19,8 +19,9 @@ class Scores:
     """Results of m episodes.
 
     Attributes:
-        results: name -> (m,): `return`, `length` [s], `fault`, `success` if the task defines it,
-            and the mean, RMS and final value of every measure (`tip_error mean` and so on).
+        results: name -> (m,): `return`, `length` [s], `fault` (1 if the simulation became unstable),
+            `success` if the task defines it, and the mean, RMS and final value of every measure
+            (`tip_error mean` and so on).
         units: name -> unit.
     """
 

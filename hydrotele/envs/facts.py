@@ -67,12 +67,12 @@ class TaskSetup(NamedTuple):
         task: the task.
         options: the user's options with all defaults filled in.
         clock: clocks of the environment.
-        machine: nominal machine, without planted or randomised effects, as a controller knows it.
+        machine: the machine without added or randomised effects, as a controller knows it.
         axes: driven axes in the order of the actions (`valve`, `joint_rate`).
         arm_axes: number of arm axes, which come first in `axes`.
         variants: machines and starts of the episodes.
         fields: fields of the observation.
-        drive_table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drives`.
+        drive_table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drive_geometry`.
     """
 
     task: Task
@@ -170,8 +170,8 @@ def full_action_rate(machine: Machine, axis: str) -> float:
         axis: name of the axis.
 
     Returns:
-        The rate [rad/s] or [m/s]: 0.8 times the rated flow, or the pump flow if that is smaller,
-        divided by the head-side area and the largest moment arm; 0.5 for an axis without a valve.
+        The rate [rad/s] or [m/s]: 0.8 times the smaller of rated valve flow and pump flow, divided by the
+        head-side area and the largest moment arm; 0.5 for an axis without a valve.
     """
     facts = machine.axes[axis]
     low, high = machine.joints[facts.joint].range or (-1.0, 1.0)

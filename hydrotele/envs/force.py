@@ -68,7 +68,7 @@ def compute_plate_force(f, w):
     Returns:
         The force, scalar [N].
 
-    Source: `simulate.surroundings`; positions are one step ahead, see `simulate.record`.
+    Source: `simulate.surroundings`. MuJoCo's positions are one step ahead of the forces and are moved back.
     """
     dof, joint = int(f.parameters[PLATE_DOF]), int(f.parameters[PLATE_JOINT])
     stiffness = struct_field_view(w.model, f.at_stiffness, joint + 1)[joint]
@@ -84,7 +84,7 @@ def draw_force_references(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; both forces and the time are written to `goal`.
         w: SimulationView.
 
     Returns:
@@ -119,7 +119,7 @@ def update_force_measurement(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; the three forces are written to `goal`.
         w: SimulationView.
 
     Returns:
@@ -174,7 +174,7 @@ def compute_force_reward(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE.
+        e: record of EPISODE_STATE; the maximum force in `goal` is reset to 0.
         w: SimulationView; `measures` receives the force error [N] and, as 0 or 1, contact with the plate, an
             overload, and a tip that is no longer over the plate.
 
@@ -260,8 +260,9 @@ HOLD_FORCE = Task(
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
-    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
-    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

@@ -210,7 +210,9 @@ def compute_bucket_edge_velocity(f, e, w, rates):
 
 @compiled
 def step_soil_bed(f, e, w):
-    """Advance soil and bucket by one control period; the force acts during the next period.
+    """Advance soil profile and bucket contents by one control period, and apply the soil force to the bucket.
+
+    The force acts during the next control period.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -333,7 +335,7 @@ def compute_profile_error(g, surface, first, last):
 
 @compiled
 def _add_mound(surface, middle, half, height):
-    """Add a mound with a raised-cosine shape to the surface."""
+    """Add a raised-cosine mound, `half` on either side of the radius `middle`, to the surface heights [m]."""
     for i in range(len(surface)):
         place = (PROFILE_START + (i + 0.5) * CELL_LENGTH - middle) / half
         if abs(place) < 1.0:
@@ -346,8 +348,8 @@ def draw_grade_episode(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
-        w: SimulationView; `terrain` and the first `measures` are written.
+        e: record of EPISODE_STATE; soil index and target plane are written to `goal`.
+        w: SimulationView; `terrain` and, in `measures`, RMS error and soil index are written.
 
     Returns:
         Nothing.
@@ -422,9 +424,10 @@ def compute_grade_reward(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
-        w: SimulationView; `measures` receives the RMS error [m], mass carried [kg], soil force [N], index of
-            the soil, and, as 0 or 1, whether the ground is graded and whether it was spoiled.
+        e: record of EPISODE_STATE; `goal` receives the RMS error and the time for which it was small.
+        w: SimulationView; `measures` receives the RMS error [m], mass carried [kg], soil force [N] and index
+            of the soil. Two more values are 0 or 1: whether the ground has been flat for long enough
+            (success), and whether the edge went so far below the target plane that the episode fails.
 
     Returns:
         (reward, whether the episode ends), scalars.
@@ -508,8 +511,9 @@ GRADE = Task(
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
-    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
-    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

@@ -130,14 +130,14 @@ def make_action_space(core: TaskCore) -> Box:
 
 
 def make_info(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
-    """Return the `info` of the last step: task measures, variant and fault.
+    """Return the `info` of the last step: task measures, index of the machine variant, and fault.
 
     Args:
         core: the running task.
         final: whether to return the values before an autoreset in the same step.
 
     Returns:
-        Name -> (n,) values.
+        Name -> (n,) values; `fault` is True if the simulation became unstable.
     """
     told, which = core.setup.task.measures, "last_" if final else ""
     figures = core.final_measures if final else core.measures
@@ -524,5 +524,5 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _add_validity_masks(infos: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Add gymnasium's masks, which mark the environments for which an entry is valid."""
+    """Add to every entry `name` of `infos` a mask `_name` (n,) of the environments for which it is valid."""
     return infos | {f"_{name}": mask.copy() for name in infos}

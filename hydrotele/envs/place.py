@@ -122,7 +122,7 @@ def measure_free_joints(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written from MEASURED_START on.
+        e: record of EPISODE_STATE; both angles and then both rates are written to `goal`.
         w: SimulationView, with staggered positions and velocities, see `simulate.record`.
 
     Returns:
@@ -152,7 +152,7 @@ def update_grapple(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; the measured swing angles and rates are written to `goal`.
         w: SimulationView after a physics step; the weld is written.
 
     Returns:
@@ -270,7 +270,7 @@ def draw_log_poses(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; the goal pose is written to `goal`.
         w: SimulationView; the log's coordinates are written.
 
     Returns:
@@ -377,9 +377,9 @@ def compute_place_reward(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; `goal` receives the remaining distance and the time at the goal.
         w: SimulationView; `measures` receives the distance [m] and yaw error [rad] of the log, whether it is
-            held, success, and the angle of the grapple to the vertical [rad].
+            held, whether it is placed, and the angle of the grapple to the vertical [rad].
 
     Returns:
         (reward, whether the log is placed or out of reach), scalars.
@@ -479,8 +479,9 @@ PLACE_LOG = Task(
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
-    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
-    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

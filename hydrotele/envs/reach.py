@@ -68,7 +68,7 @@ def draw_reach_goal(f, e):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; the goal pose is written to `goal`.
 
     Returns:
         Nothing.
@@ -163,9 +163,9 @@ def compute_reach_reward(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; `goal` receives the remaining distance and the time held.
         w: SimulationView; `measures` receives the distance [m], the larger error of attitude and head [rad],
-            and success.
+            and, as 0 or 1, whether the pose has been held for `HOLD_TIME`.
 
     Returns:
         (reward, whether the pose was reached), scalars.
@@ -217,8 +217,9 @@ REACH_FELLER = Task(
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
-    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
-    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

@@ -56,7 +56,7 @@ _MIN_LOOSE_THICKNESS = 1e-3  # m, maximum thickness of loose soil that is not dr
 
 
 def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
-    """Return the rotation (3, 3) of the house, which is that of the plane of the arm."""
+    """Return the rotation matrix (3, 3) of the machine's upper structure, and thus of the plane of the arm."""
     swing = float(core.episodes["position"][number][0])
     c, s = math.cos(swing), math.sin(swing)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

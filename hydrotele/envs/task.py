@@ -39,7 +39,7 @@ class Task:
         action: default kind of actions.
         duration: duration of an episode [s].
         start: (machine, random generator) -> axis or joint name -> position at the start.
-        fields: (machine, driven axes) -> fields that `observe_<kind>` writes.
+        fields: (machine, driven axes) -> fields that `write_<kind>_observation` writes.
         measures: name and unit of every task measure in `info`.
         surroundings: (machine, random generator, start) -> objects around the machine.
         ground: whether there is a hard ground.
@@ -195,7 +195,7 @@ def compute_measured_pose(f, e, pose):
     Returns:
         Nothing.
 
-    Source: `kinematics.task.task_forward`.
+    Source: `kinematics.task.compute_tip_pose`.
     """
     compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
 

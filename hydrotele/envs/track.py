@@ -61,7 +61,7 @@ def draw_track_references(f, e):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written.
+        e: record of EPISODE_STATE; the Fourier coefficients are written to `goal`.
 
     Returns:
         Nothing.
@@ -176,8 +176,9 @@ def compute_track_reward(f, e, w):
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
 
-    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
-    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

@@ -66,7 +66,7 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     Args:
         task: the task.
         options: the user's options, whose effects are applied.
-        nominal: machine without the effects.
+        nominal: the machine before any effect is applied.
 
     Returns:
         The variants.
@@ -227,10 +227,10 @@ def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
     """Return effects with typical parameter ranges for `Options.randomise`.
 
     Args:
-        machine: the nominal machine.
+        machine: the machine without effects; the ranges are relative to its parameters.
 
     Returns:
-        For every valve, the overlap (0.5 to 2 times nominal), flow (0.8 to 1.2) and bandwidth (0.6
+        For every valve, the overlap (0.5 to 2 times its value), flow (0.8 to 1.2) and bandwidth (0.6
         to 1.4); for every drive with a valve, the Coulomb friction (0.5 to 2); for the machine, the
         bulk modulus (0.6 to 1.2), the command delay (0 to 50 ms) and a payload (0 to 2 % of its
         mass).

@@ -47,8 +47,8 @@ class SimulationView(NamedTuple):
         xquat: (4 nbody,) quaternions of the bodies.
         xmat: (9 nbody,) rotation matrices of the bodies.
         eq_active: (neq,) uint8, whether an equality constraint is active; part of the state.
-        eq_data: (neq eq_width,) data of the equality constraints during this call.
-        eq_rows: the same from the next call on; empty unless the task writes it.
+        eq_data: (neq eq_width,) data of the equality constraints; changes last until the end of this call.
+        eq_rows: the same data from the next call on; empty unless the task changes constraints.
         terrain: (width,) terrain state of the episode; empty for tasks without terrain.
         measures: (MAX_MEASURES,) task measures of this step, for `info`.
         model: address of mjModel.

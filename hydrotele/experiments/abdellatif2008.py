@@ -67,7 +67,7 @@ HINGES = ("alpha", "beta")
 
 @cache
 def load_complete_friction_setup() -> RegressorSetup:
-    """Return the regressor setup with separate dry and viscous friction parameters of every passive hinge."""
+    """Return PaLiDA's regressor setup with separate dry and viscous friction of every passive hinge."""
     mapping, folder = load_robot().mechanism.mapping, models_folder() / "palida"
     complete = ColumnMapping(
         position=mapping.position, force=mapping.force, coordinates=mapping.coordinates,
@@ -79,13 +79,13 @@ def load_complete_friction_setup() -> RegressorSetup:
 
 
 def build_complete_friction_regressor(motion: np.ndarray) -> Regressor:
-    """Compute the regressor with separate friction parameters of every passive hinge along a motion.
+    """Compute PaLiDA's regressor along a motion, with separate friction parameters of every passive hinge.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations of the platform.
 
     Returns:
-        The regressor of the drive forces, with the setup of `load_complete_friction_setup`.
+        The regressor of the drive forces.
     """
     setup = load_complete_friction_setup()
     return setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *motion))
@@ -155,7 +155,8 @@ def _is_passive(name: str) -> bool:
 def evaluate_friction_reduction(samples: Sequence[Sample]) -> Evaluation:
     """Check that most simulated data sets lead to the published friction model of the passive joints.
 
-    In this model all joints of one kind share one dry friction parameter.
+    In the model of Abdellatif 2008 all passive joints of one kind share one dry friction parameter,
+    and have no viscous friction.
     """
     check = check_fraction(
         "fraction of the data sets that lead to these 14 friction parameters",
@@ -286,7 +287,7 @@ PATH_PLANNERS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "s
 
 
 def measure_tracking_errors(seed: int, changes: Changes) -> Sample:
-    """Simulate path tracking with three control strategies on a circle and a square at four speeds.
+    """Simulate path tracking of PaLiDA with three control strategies on a circle and a square at four speeds.
 
     The strategies are linear control alone, with feedforward of nominal parameters, and with
     feedforward of identified parameters.
@@ -373,12 +374,20 @@ def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation
 
 
 def evaluate_circle_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the RMS actuator errors of the three control strategies on the circle."""
+    """Compare the RMS actuator errors of the three control strategies on the circle.
+
+    The strategies are linear control, and feedforward of nominal or of identified parameters. Each
+    must have smaller errors than the one before; those of linear control must increase with speed.
+    """
     return evaluate_actuator_errors(samples, "circle")
 
 
 def evaluate_square_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the RMS actuator errors of the three control strategies on the square."""
+    """Compare the RMS actuator errors of the three control strategies on the square.
+
+    The strategies are linear control, and feedforward of nominal or of identified parameters. Each
+    must have smaller errors than the one before; those of linear control must increase with speed.
+    """
     return evaluate_actuator_errors(samples, "square")
 
 

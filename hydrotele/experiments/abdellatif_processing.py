@@ -140,7 +140,7 @@ def compare_processing_methods(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of the measurement noise.
-        changes: `harmonics`: number of harmonics in the frequency-domain window.
+        changes: `harmonics`: number of harmonics that the frequency-domain method keeps.
 
     Returns:
         Relative RMS errors of the reconstructed y coordinate and its derivatives, and error variances

@@ -99,7 +99,7 @@ class NormalEquations:
         self._products = products.transpose(0, 2, 1, 3)
 
     def information(self, weight: np.ndarray) -> np.ndarray:
-        """Return the (24, 24) information matrix: the inverse of the parameter covariance P in (28).
+        """Return the (24, 24) information matrix: inverse of the parameters' covariance.
 
         Args:
             weight: (6, 6) weight of the drives, the inverse of their noise covariance [1/N^2].
@@ -169,14 +169,14 @@ TRIAL_SETTINGS = {
 
 
 def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
-    """Identify the robot in a series of trials with new force noise in every trial.
+    """Identify PaLiDA in a series of trials with new force noise in every trial.
 
-    All trials of a series use the same leg length noise, whose effect on the estimates is small;
-    see `evaluate_ellipsoid`.
+    All trials of a series use the same leg length noise, whose effect on the estimates is small.
 
     Args:
         seed: seed of the series.
-        settings: see `TRIAL_SETTINGS`.
+        settings: friction excess, force noise, processing and number of trials, as in
+            `TRIAL_SETTINGS`.
 
     Returns:
         The estimates of all trials.
@@ -217,12 +217,14 @@ def compute_trial_statistics(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of the series.
-        changes: changes of `TRIAL_SETTINGS`.
+        changes: changes of `TRIAL_SETTINGS`, such as the number of trials.
 
     Returns:
-        Arrays `value` and `least_squares` (t, 24), `std` (24,), and `distance` (t,), the squared
-        Mahalanobis distance of each estimate from the mean of all trials after the first. The values
-        describe the first trial and the fractions of estimates inside intervals.
+        Arrays of the t trials. `value` (t, 24) are Gauss-Markov estimates with standard deviations
+        `std` (24,); `least_squares` (t, 24) are unweighted. `distance` (t,) is the squared
+        Mahalanobis distance of each estimate from the mean of all trials after the first. The
+        scalar values are distances of the first trial from this mean, and fractions of estimates
+        inside and outside of 95 % intervals.
     """
     trials = simulate_trials(seed, merge_settings(TRIAL_SETTINGS, changes))
     later = trials.value[1:]
@@ -282,7 +284,10 @@ def _draw_distance(distance: np.ndarray) -> Panel:
 
 
 def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
-    """Check that at least 90 % of the simulated estimates lie inside the printed 95 % intervals."""
+    """Check that at least 90 % of the simulated estimates lie inside the published 95 % intervals.
+
+    These are printed in Abdellatif 2008, Table 2; the first trial of a series does not count.
+    """
     check = check_mean(
         "fraction of the estimates within the printed 95 % intervals", collect_values(samples, "printed"),
         (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % expected outside a 95 % interval",
@@ -291,7 +296,10 @@ def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the standard deviations of the 24 parameters are within a factor of two of the printed ones."""
+    """Check that the 24 standard deviations of parameters are within a factor of two of the published ones.
+
+    These follow from the intervals that are printed in Abdellatif 2008, Table 2.
+    """
     ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _PRINTED_DEVIATIONS
     low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
     words = "standard deviation over the printed one, "
@@ -324,7 +332,11 @@ def evaluate_estimates_over_trials(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether more than 10 % of the estimates of the first parameter p1 lie outside their 95 % intervals."""
+    """Check whether more than 10 % of the estimates of the first parameter lie outside their 95 % intervals.
+
+    This parameter p1 is a sum of moments of inertia. The intervals are about the mean of a series
+    of trials, as in Abdellatif 2008, Fig. 8.
+    """
     check = check_mean(
         "fraction of the estimates of p1 outside their intervals", collect_values(samples, "p1"),
         (MAX_EXCEPTIONS, 1.0),
@@ -360,9 +372,10 @@ def evaluate_first_trial(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_ellipsoid(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the fraction of trials within the 95 % confidence ellipsoid with the published 99 of 99.
+    """Compare the fraction of trials within the 95 % confidence ellipsoid with 99 of 99 published trials.
 
-    The first trial of each series does not count.
+    The ellipsoid of the parameter estimates is centred at the mean of the series (Abdellatif 2008,
+    Fig. 9). The first trial of each series does not count.
     """
     distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
     published = TRIALS_PER_SERIES - 1
@@ -451,7 +464,8 @@ def measure_bias_by_encoder_feedback(seed: int, changes: Changes) -> Sample:
         changes: `length_noise`: factor of the standard deviation of a measured length.
 
     Returns:
-        Errors (24,) of the estimates by each of `METHODS`, in printed standard deviations.
+        Errors (24,) of the estimates by each method, in published standard deviations. The methods
+        are least squares and Gauss-Markov on unfiltered samples, and Gauss-Markov on mean periods.
     """
     settings = merge_settings({"length_noise": 1.0}, changes)
     own, cycle, periods = load_robot(), simulate_excitation(), 2
@@ -473,7 +487,10 @@ def measure_bias_by_encoder_feedback(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_bias_by_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
-    """Check that encoder noise in regressor and forces biases estimates from samples, but not from mean periods."""
+    """Check that encoder noise in regressor and forces biases estimates from unfiltered samples.
+
+    Estimates from averaged periods, which are filtered in the frequency domain, must not be biased.
+    """
     checks = []
     for name, words in METHODS.items():
         biased = name.startswith("samples")

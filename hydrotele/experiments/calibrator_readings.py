@@ -64,7 +64,7 @@ def sample_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: f
     Args:
         rng: random generator of cycles and phase.
         drift: whether held links drift as in the figures.
-        pose_fraction: fraction of the document's number of poses.
+        pose_fraction: fraction of the published number of poses.
 
     Returns:
         Link -> sweep.
@@ -93,7 +93,7 @@ def sample_gravity_bends(
         clean: true poses (M poses of N joints).
         rng: random generator of the errors.
         deviation_deg: standard deviation of the errors [deg].
-        bent_fraction: fraction of the poses in which joints bend; the document gives none.
+        bent_fraction: fraction of the poses in which joints bend, which the thesis does not state.
         constant: whether a joint has the same error in all bent poses.
 
     Returns:
@@ -246,7 +246,11 @@ def compute_tip_errors(
 def _compute_squared_tip_error(
     machine: Machine, known: CalibrationLoop, loop: CalibrationLoop, model, data, target
 ) -> float:
-    """Return the squared distance of the true tip from a target that a machine model commands [m^2]."""
+    """Return the squared distance [m^2] of the true arm's tip from a target position.
+
+    The commanded joint angles are computed with `machine`, a nominal or calibrated model. MuJoCo
+    computes the tip of the true machine, whose sensors read these angles.
+    """
     r, z, theta = target
     here = {name: machine.home.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     joints = pose_to_joints(machine, Pose(r=r, z=z, theta=theta), here, "target")

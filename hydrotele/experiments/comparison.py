@@ -95,7 +95,7 @@ class Check(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict: `agrees` if the whole interval is accepted, `differs` if no part of it is."""
+        """Verdict: `agrees` if the whole interval is accepted, `differs` if no part of it is, else `undecided`."""
         least, most = self.accepted
         if not np.isfinite(self.value):
             return "differs"
@@ -155,7 +155,10 @@ class Evaluation(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict: `differs` if one check differs, `agrees` if all agree, else `undecided`."""
+        """Verdict: `differs` if one check differs, `agrees` if all agree, else `undecided`.
+
+        It is `cannot be computed` if a reason for this is given, and `no verdict` without checks.
+        """
         if self.unavailable:
             return "cannot be computed"
         verdicts = {check.verdict for check in self.checks}
@@ -189,7 +192,7 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the evaluation; `no verdict` if only a caption is published."""
+        """Verdict of the evaluation; `no verdict` if there are no checks because only a caption is published."""
         return self.evaluation.verdict
 
     @property

@@ -149,7 +149,7 @@ def identify_with_disturbance(
         loop: nominal chain, which is also the true one.
         disturbance: disturbances of the readings.
         seed: seed of trajectories and errors; the trajectories depend only on the seed.
-        pose_fraction: fraction of the document's number of poses.
+        pose_fraction: fraction of the published number of poses.
         bent_fraction: fraction of the poses in which joints bend.
 
     Returns:
@@ -180,7 +180,7 @@ def measure_disturbance_effects(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of trajectories and errors.
-        changes: changes of `SETTINGS`.
+        changes: changes of `SETTINGS`: drift, sensor errors, bends, numbers of poses.
 
     Returns:
         For each combination, the errors of all parameters [m] or [rad], their RMS values, and the
@@ -225,7 +225,8 @@ def compare_initial_estimates(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of readings and initial estimates.
-        changes: changes of `INITIAL_ESTIMATE_SETTINGS`.
+        changes: changes of `INITIAL_ESTIMATE_SETTINGS`: number of initial estimates and their
+            largest distance from nominal; fraction of the poses.
 
     Returns:
         `spread`: largest difference of any identified parameter [m] or [rad].
@@ -263,13 +264,13 @@ def measure_exact_readings(seed: int, changes: Changes) -> Sample:
 
 
 def check_published_length_errors(samples: Sequence[Sample], case: str) -> list[Check]:
-    """Return one check per link length: whether its published error is typical of the simulated errors.
+    """Return one check per link length: whether its published error could be a simulated one.
 
     A published error agrees if it lies in the central 95 % of the repetitions.
 
     Args:
         samples: samples of `measure_disturbance_effects`.
-        case: `drift` or `sensor`.
+        case: `drift` (Khoshzaban 1992, Table 4) or `sensor` (Table 5).
     """
     return [
         check_published_in_population(
@@ -280,7 +281,10 @@ def check_published_length_errors(samples: Sequence[Sample], case: str) -> list[
 
 
 def check_d0_error_is_largest(samples: Sequence[Sample], case: str) -> Check:
-    """Return a check whether length d0 has the largest error of all lengths in most simulated trajectories."""
+    """Return a check whether d0 has the largest error of all lengths in most simulated trajectories.
+
+    d0 is the height of the ball joint on the chassis in Khoshzaban 1992.
+    """
     leads = [abs(s.values[f"{case}.error.p_z.swing"]) >= s.values[f"{case}.largest"]
              for s in samples]  # fmt: skip
     return check_fraction(
@@ -327,7 +331,8 @@ A3_ERROR_REASON = (
 def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
     """Compare the parameter errors that drift of held links causes with Khoshzaban 1992, Table 4.
 
-    Length d0 must have the largest error, and each published error must be typical of the repetitions.
+    Length d0, the height of the ball joint, must have the largest error. Each published error must
+    lie in the central 95 % of the repetitions.
     """
     # alpha 1 is the only twist that drift changes; it is printed as -90.0 deg.
     twist = check_published_in_population(
@@ -344,7 +349,9 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the parameter errors that drift and sensor errors cause with Khoshzaban 1992, Table 5.
 
-    The twist errors (alpha and beta) must also be proportional to the sensor errors.
+    Each published error must lie in the central 95 % of the repetitions, and the height d0 of the
+    ball joint must have the largest error. The twist errors (alpha and beta) must be proportional
+    to the sensor errors.
     """
     twists = check_published_in_population(
         "RMS error of alpha and beta", np.degrees(collect_values(samples, "sensor.twists")),
@@ -449,7 +456,7 @@ def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_sensor_fraction_of_error(samples: Sequence[Sample]) -> Evaluation:
     """Check whether sensor errors cause half of the error of the swing's length a1.
 
-    Khoshzaban 1992, p. 60, says so for sensors within 0.1 deg with drift.
+    Khoshzaban 1992, p. 60, states this for sensors within 0.1 deg with drift.
     """
     rows = np.column_stack([collect_values(samples, f"{case}.error.a.swing")
                             for case in ("half", "sensor", "drift")])  # fmt: skip
@@ -467,7 +474,10 @@ def evaluate_sensor_fraction_of_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
-    """Check that solver iterations increase with noise and are most for link 2, as in Khoshzaban 1992, p. 62."""
+    """Check that solver iterations increase with the noise of the readings, and are most for the boom.
+
+    Khoshzaban 1992, p. 62, states this; the boom is link 2 there.
+    """
     totals = {case: sum(counts) for case, counts in PUBLISHED_ITERATIONS.items()}
     checks = []
     for case in ("sensor", "flexible"):
@@ -496,7 +506,7 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that usually more than half of the six identified lengths have errors below 5 %.
 
-    Khoshzaban 1992, p. 122, says so for resolvers of 0.1 deg; held links drift.
+    Khoshzaban 1992, p. 122, states this for resolvers of 0.1 deg; held links drift.
     """
     errors = np.array([[abs(s.values[f"sensor.error.{n}"] / NOMINAL_LENGTHS[n]) for n in LENGTH_PARAMETERS]
                        for s in samples])  # fmt: skip
@@ -511,7 +521,7 @@ def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
     """Check that all initial estimates lead to the same identified parameters.
 
-    Khoshzaban 1992 says so on pp. 62 and 121.
+    Khoshzaban 1992 states this on pp. 62 and 121.
     """
     return Evaluation((
         check_deterministic_value("largest difference of the results", float(collect_values(samples, "spread").max()),

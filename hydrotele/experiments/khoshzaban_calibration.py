@@ -185,7 +185,7 @@ def measure_calibration_errors(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
-        changes: changes of `SETTINGS`.
+        changes: changes of `SETTINGS`: drift, sensor errors, bends and other conditions.
 
     Returns:
         Errors of parameters, end points, distances and cylinder triangles, with their curves.
@@ -210,11 +210,12 @@ def measure_bend_detection(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
-        changes: changes of `SETTINGS`.
+        changes: changes of `SETTINGS`: drift, sensor errors, bends and other conditions.
 
     Returns:
-        By the equations: `overlap` of detected and bent poses (intersection over union), and `blamed`
-        (whether only bent joints are detected). By the model: fraction `left out` of the bent poses.
+        With the equations alone: `overlap` of detected and bent poses (intersection over union),
+        and `blamed` (whether only bent joints are detected). With the nominal model: fraction `left
+        out` of the bent poses that are excluded.
     """
     chosen = merge_settings(SETTINGS, changes)
     done = simulate_stages(seed, chosen, np.random.default_rng([38, seed]))
@@ -237,7 +238,10 @@ def measure_bend_detection(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit) -> dict[str, float]:
-    """Return the errors of one model's identified parameters [m] or [rad], with RMS values and iterations."""
+    """Return the errors of the parameters of one fit [m] or [rad], with their RMS values and iterations.
+
+    `model` is the prefix of the names, `identified` or `reidentified`.
+    """
     truth = dict(zip(fit.names, find_true_parameters(calibration.true_loop, calibration.loop, fit.names,
     calibration.true_poses),
                      strict=True))  # fmt: skip
@@ -372,7 +376,11 @@ def _compare_end_points(calibration: Calibration) -> Sample:
 
 
 def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Generator) -> Sample:
-    """Compare distances from end points to the ball by each model with simulated tape measurements."""
+    """Compare distances from end points to the ball, computed by each model, with a simulated tape measure.
+
+    The tape has normal errors with the standard deviation `tape` [m]. The models are the nominal
+    one and those identified with and without the bent poses.
+    """
     pairs = [(one, stage) for one, stage in zip(calibration.true_poses, calibration.stages, strict=True)
              if stage.link in SIMULATED_STAGES]  # fmt: skip
     truth = np.concatenate([one.theta for one, _ in pairs])

@@ -37,7 +37,7 @@ def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
     """Compare the identified lengths of the cylinder triangles with Khoshzaban 1992, Table 11.
 
     Args:
-        samples: samples of `measure_calibration`.
+        samples: samples of `measure_calibration_errors`.
         kind: source of the joint angles, `measured` or `identified` (computed from the calibrator).
     """
     checks = []
@@ -66,7 +66,7 @@ def _describe_angles(samples: Sequence[Sample]) -> str:
 
 
 def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
-    """Return the mean deviations of the triangles from the taped ones, with 95 % intervals, as text."""
+    """Return the mean deviations of the triangles from those measured with a tape, with 95 % intervals, as text."""
     parts = []
     for axis in ("boom", "stick"):
         for name in PARAMETER_NAMES:
@@ -81,7 +81,7 @@ def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
 def compare_measured_and_computed_angles(samples: Sequence[Sample]) -> Evaluation:
     """Check that measured joint angles give more accurate cylinder triangles than computed angles.
 
-    Khoshzaban 1992, p. 77, says so; computed angles follow from the calibrator's readings.
+    Khoshzaban 1992, p. 77, states this; computed angles follow from the calibrator's readings.
     """
     checks = []
     for axis in ("boom", "stick"):
@@ -110,7 +110,7 @@ def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
     """Compare the RMS errors of computed piston displacements with Khoshzaban 1992, Table 12.
 
     Args:
-        samples: samples of `measure_calibration`.
+        samples: samples of `measure_calibration_errors`.
         kind: source of the joint angles, `measured` or `identified` (computed from the calibrator).
     """
     checks = [

@@ -45,11 +45,11 @@ def make_thesis_regressor_setup(
 
     Args:
         model: `complete` (82 parameters) or `reduced` to the major links (36).
-        ball_joints: whether the cylinders end in ball joints, as in the document, or in pins.
+        ball_joints: whether the cylinders end in ball joints, as in Khoshzaban 1992, or in pins.
         tilt_deg: slope of the ground, about the machine's y axis.
 
     Returns:
-        The setup; friction and offsets are zero, as in Table 13.
+        The setup; friction and offsets are zero, as in Khoshzaban 1992, Table 13.
 
     Source: Khoshzaban 1992, p. 92, Eq. 4.23; pp. 97 to 98, Eqs 4.51 to 4.56.
     """
@@ -178,7 +178,7 @@ class BaseParameters:
         return np.linalg.lstsq(r, q.T @ right, rcond=_RANK_TOLERANCE)[0].T / length
 
     def build_regressor(self, motion: Motion) -> np.ndarray:
-        """Return the (3 n, p) regressor of the base parameters."""
+        """Return the (3 n, p) regressor of the base parameters along a motion of n samples."""
         return stack_rows(make_regressor(self.setup, motion))[:, self.classification.base]
 
 
@@ -192,7 +192,7 @@ def find_base_parameters(model: DynamicModel, ball_joints: bool = True) -> BaseP
 
     Args:
         model: `complete` or `reduced`.
-        ball_joints: see `make_thesis_regressor_setup`.
+        ball_joints: whether the cylinders end in ball joints, otherwise in pins.
 
     Returns:
         The base parameters.

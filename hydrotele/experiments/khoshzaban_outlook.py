@@ -45,7 +45,7 @@ def count_undetermined_parameters(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: not used.
-        changes: changes of `LINKAGE_SETTINGS`.
+        changes: `axial_offset`: distance of the two pins along the joint axis [m].
 
     Returns:
         Number of undetermined parameters per set of sensors, and number of angle sensors `needed`.
@@ -117,7 +117,9 @@ def identify_with_flexibility_model(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of poses, bends and sensor errors.
-        changes: changes of `FLEXIBILITY_SETTINGS`.
+        changes: `bend`: standard deviation of the errors of bent joints [deg]; `bent_share`:
+            fraction of the poses in which they bend; `estimated`: whether the noise model is
+            estimated.
 
     Returns:
         Mean squared length errors [m^2] and coverage of the 95 % intervals of both fits, and the

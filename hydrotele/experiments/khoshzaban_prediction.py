@@ -80,12 +80,12 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     """Identify the complete and the reduced model, and predict the forces of a held-out motion.
 
     The complete model includes the cylinders' inertia. The models are identified with the method of
-    `hydrotele identify`. For comparison they are also identified with the document's method: least
-    squares of all base parameters with an optimal smoother.
+    `hydrotele identify`. For comparison they are also identified with the method of Khoshzaban
+    1992: least squares of all base parameters with an optimal smoother.
 
     Args:
         seed: seed of the sensor errors and of the nominal model's errors.
-        changes: changes of `SETTINGS`.
+        changes: changes of `SETTINGS`: sensor errors, friction, errors of the nominal model.
 
     Returns:
         RMS prediction errors per model and drive, and fractions of unrealistic parameters.
@@ -140,7 +140,10 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
 def _simulate_records(
     swing_friction: float,
 ) -> tuple[list[IdentificationRecord], list[IdentificationRecord]]:
-    """Simulate records without sensor errors: several for identification and one held-out record."""
+    """Simulate records without sensor errors: several for identification and one held-out record.
+
+    `swing_friction` is the dry friction of the swing [N m].
+    """
     numbers = f"{{coulomb: {swing_friction}}}"
     friction = f"{{name: coulomb_friction, location: swing, parameters: {numbers}}}"
     own, files = {"sensors": "ideal", "effects": f"[{friction}]"}, []
@@ -177,7 +180,7 @@ def _add_sensor_errors(
 
 
 def _differentiate_record(record: IdentificationRecord) -> Motion:
-    """Compute positions, rates and accelerations of a record with the optimal smoother (p. 112)."""
+    """Compute positions, rates and accelerations of a record with the optimal smoother (Khoshzaban 1992, p. 112)."""
     found = smooth_and_differentiate(record.position, record.period, record.position_noise)
     return found.value, found.rate, found.acceleration
 
@@ -194,7 +197,7 @@ def _add_model_errors(setup: RegressorSetup, mass_error: float, rng: np.random.G
 def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.ndarray:
     """Return the base parameters (p,) of the simulated machine, including its Coulomb friction.
 
-    The machine of Table 13 has no friction.
+    `base` contains those of the machine of Khoshzaban 1992, Table 13, which has no friction.
     """
     machine = load_machine("cat215")
     dry = {
@@ -241,7 +244,7 @@ FORCE_LABELS = tuple(
 
 
 def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, accepted, reason):
-    """Return a check of the ratio of two models' RMS force errors of drive k over all repetitions."""
+    """Return a check of the RMS force error of model `one` over that of model `other` for drive k."""
     drive = DRIVES[k]
     rows = np.array([[s.values[f"{m}.{drive}"] for m in (one, other)] for s in samples])
     return check_bootstrapped_statistic(
@@ -254,7 +257,8 @@ def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, ac
 def evaluate_reduced_model(samples: Sequence[Sample]) -> Evaluation:
     """Check that the complete model predicts forces better than the reduced one.
 
-    For swing and stick, at least half of the published gain is required.
+    The complete model includes the cylinders' inertia. For swing and stick, at least half of the
+    gain in Khoshzaban 1992, Fig. 37, is required.
     """
     checks = []
     for k in range(3):
@@ -292,7 +296,8 @@ def _describe_rms_errors(samples: Sequence[Sample]) -> str:
 def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
     """Check that the nominal model predicts forces worse than the identified complete model.
 
-    Each drive must reach at least half of the smallest published excess.
+    The ratio of their errors must exceed 1 by at least half of the smallest excess of a drive in
+    Khoshzaban 1992, Fig. 37.
     """
     ratios = np.divide(PUBLISHED_RMS["nominal"], PUBLISHED_RMS["complete"])
     checks = tuple(
@@ -314,7 +319,8 @@ def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_errors_against_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Check that the force errors of the complete model are almost within the accuracy of the sensors.
 
-    The limit is the largest published ratio that the document calls almost within.
+    The limit is the largest ratio of error to accuracy in Khoshzaban 1992, p. 117, which calls it
+    almost within.
     """
     ratios = np.divide(PUBLISHED_RMS["complete"], SENSOR_ACCURACY)
     checks = [

@@ -35,12 +35,15 @@ def measure_parameter_errors(seed: int, changes: Changes) -> Sample:
     """Compute parameter errors for pressure sensors of 25 psi, of 5 psi, and without errors.
 
     Uniform errors are added to the simulated angles and forces. Rates and accelerations are exact,
-    because the document adds errors only to resolvers and pressures. The better sensors have the
+    because Khoshzaban 1992 adds errors only to resolvers and pressures. Further cases have exact
+    angles (`pressures`) or rates from noisy angles (`differentiated`). The better sensors have the
     same random errors divided by five; in case `independent` they have independent errors.
 
     Args:
         seed: seed of the motion and the errors.
-        changes: changes of `NOISE_SETTINGS`.
+        changes: `noise`: factor of the errors; `residual_noise`: factor of the errors of exact
+            sensors; `pressure_gain`: ratio of both pressure errors; `cylinders_known`: whether only
+            the links of the complete model are identified.
 
     Returns:
         Errors of the base parameters over their reference sizes [1], per model and case.

@@ -56,11 +56,11 @@ class PublishedParameter(NamedTuple):
 
     @property
     def std(self) -> float:
-        """Standard deviation, computed from the printed interval.
+        """Standard deviation, a quarter of the width of the printed 95 % interval.
 
-        The printed standard deviations agree with it to rounding except for p6 to p9, which are
-        shifted cyclically by one row: p6 has that of p9, p7 that of p6, p8 that of p7 and p9 that
-        of p8.
+        The standard deviations printed in Abdellatif 2008, Table 2, agree with it to rounding
+        except for p6 to p9, which are shifted cyclically by one row: p6 has that of p9, p7 that of
+        p6, p8 that of p7 and p9 that of p8.
         """
         return 0.25 * (self.interval[1] - self.interval[0])
 
@@ -113,11 +113,13 @@ class Robot:
 
     @property
     def setup(self) -> RegressorSetup:
-        """Setup of the regressor in coordinates of the pose."""
+        """Setup of the regressor of drive forces in coordinates of the platform's pose."""
         return self.mechanism.setup
 
     def matrix(self, motion: np.ndarray) -> np.ndarray:
-        """Compute the regressor (n, 6, 24): drive forces per parameter of Table 2.
+        """Compute the regressor (n, 6, 24): force of each drive per unit of each parameter at n samples.
+
+        The parameters are those of Abdellatif 2008, Table 2.
 
         Args:
             motion: (3, n, 6) poses, rates and accelerations.
@@ -149,7 +151,7 @@ def sample_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @cache
 def load_robot() -> Robot:
-    """Load the shipped robot model and find its base parameters from 100 random states."""
+    """Load the shipped model of PaLiDA and find its base parameters from 100 random states."""
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
     setup = mechanism.setup
@@ -162,12 +164,12 @@ def load_robot() -> Robot:
 
 
 def compute_force_covariance() -> np.ndarray:
-    """Return the covariance (6, 6) of the drives' force noise [N^2], white at `SAMPLE_RATE`.
+    """Return the covariance (6, 6) of the noise of PaLiDA's six drive forces [N^2].
 
-    The document calls the noise high and cross-correlated but gives no value. The standard
-    deviations, 10 to 19 N, are proportional to the published ones of each drive's dry friction.
-    Their size and the robot's geometry are chosen to give about the published standard deviations
-    of the parameters.
+    The noise is independent from sample to sample. Abdellatif 2008 calls it high and
+    cross-correlated but gives no value. The standard deviations, 10 to 19 N, are proportional to
+    the published ones of each drive's dry friction. Their size and the robot's geometry are chosen
+    to give about the published standard deviations of the parameters.
     """
     size = FORCE_NOISE_RATIO * np.array([one.std for one in PUBLISHED_PARAMETERS[12:18]])
     return np.outer(size, size) * (FORCE_NOISE_CORRELATION + (1.0 - FORCE_NOISE_CORRELATION) * np.eye(6))
@@ -175,7 +177,7 @@ def compute_force_covariance() -> np.ndarray:
 
 @cache
 def load_excitation() -> Excitation:
-    """Load the excitation motion designed by `tools/studies/palida_study.py --design 1`."""
+    """Load the excitation motion of PaLiDA that was designed by `tools/studies/palida_study.py --design 1`."""
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
     mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(
@@ -185,7 +187,7 @@ def load_excitation() -> Excitation:
 
 
 def make_drive_limits() -> DriveLimits:
-    """Return the limits of pose, stroke, speed and acceleration for the design of motions."""
+    """Return PaLiDA's limits of pose, stroke, speed and acceleration for the design of motions."""
     return DriveLimits(
         load_robot().setup,
         POSE_LOW,
@@ -215,7 +217,7 @@ class RepeatedMotion(NamedTuple):
 
 
 def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
-    """Compute leg lengths, regressor and drive forces along one period of a motion.
+    """Compute PaLiDA's leg lengths, regressor and drive forces along one period of a motion.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations.
@@ -228,14 +230,14 @@ def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
 
 @cache
 def simulate_excitation() -> RepeatedMotion:
-    """Compute leg lengths and drive forces along the designed excitation motion at `SAMPLE_RATE`."""
+    """Compute leg lengths and drive forces along the designed excitation motion at 1 kHz."""
     motion = load_excitation()
     time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
     return simulate_motion(motion.evaluate(time), motion.period)
 
 
 def sample_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Draw random force noise (*shape, 6) of the drives [N] with covariance `compute_force_covariance`."""
+    """Draw random noise (*shape, 6) of the six drive forces [N] with covariance `compute_force_covariance`."""
     return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(compute_force_covariance()).T
 
 
@@ -276,7 +278,7 @@ _ACCELERATION_TIME = 1.0  # time to reach full speed on a circle [s]
 
 
 def compute_control_gains() -> tuple[float, float]:
-    """Return the proportional gain [N/m] and the damping gain [N s/m] of every drive's controller."""
+    """Return the proportional gain [N/m] and the damping gain [N s/m] of each drive's controller."""
     turn = 2.0 * np.pi * BANDWIDTH
     return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
 
@@ -349,7 +351,7 @@ class TrackingErrors(NamedTuple):
 
 
 def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> TrackingErrors:
-    """Track a path in MuJoCo with closed chains, friction and encoder noise.
+    """Simulate how PaLiDA tracks a path, in MuJoCo with closed chains, friction and encoder noise.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations of the reference.

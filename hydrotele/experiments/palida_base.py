@@ -55,7 +55,8 @@ def compute_inertial_transformation(rotation: np.ndarray, offset: np.ndarray) ->
         offset: (3,) origin of the body's frame in the parent's frame [m].
 
     Returns:
-        (10, 10) matrix L of (9), with rows and columns in the order of `BODY_PARAMETERS`.
+        (10, 10) matrix L of Abdellatif 2008, (9), with rows and columns in the order of
+        `BODY_PARAMETERS`.
 
     >>> unit = compute_inertial_transformation(np.eye(3), np.array([0.0, 0.0, 2.0]))
     >>> dict(zip(_KINDS, unit[:, 0].tolist()))["inertia_xx"]  # Steiner: 1 kg at a distance of 2 m
@@ -120,20 +121,23 @@ def list_regrouping_relations(chain: Chain, platform_rule: bool = True) -> Itera
 
 
 def _list_parent_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
-    """Return the coefficients by which parameters of the parent body replace a body's parameter, or a sum.
+    """Return by which parameters of the parent body, with coefficients, a body's parameter is replaced.
 
     Args:
         matrix: (10, 10) transformation from the body's to the parent's parameters.
         kind: parameter of the body.
         body: name of the parent body.
-        *more: parameters added to `kind`.
+        *more: further parameters of the body; their sum with `kind` is replaced.
+
+    Returns:
+        Parameter of the parent body -> coefficient.
     """
     column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
     return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
 
 
 def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> np.ndarray:
-    """Apply relations one after the other, to express regrouped parameters by all parameters, (11).
+    """Apply relations one after the other, to express regrouped parameters by all parameters.
 
     Args:
         names: names of the m inertial parameters.
@@ -141,6 +145,8 @@ def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> n
 
     Returns:
         (m, m) coefficients; rows of eliminated parameters are 0.
+
+    Source: Abdellatif 2008, (11).
     """
     places = {name: k for k, name in enumerate(names)}
     regrouped = np.eye(len(names))
@@ -192,7 +198,9 @@ in Table 1.
 
 
 def compare_base_parameter_methods(seed: int, changes: Changes) -> Sample:
-    """Find the base parameters by printed table, regrouping rules and null space, and compare the results.
+    """Find base parameters by a published table, by regrouping rules and by the null space; compare them.
+
+    The table is Abdellatif 2008, Table 1. The null space is that of the regressor at random states.
 
     Args:
         seed: not used.
@@ -257,7 +265,10 @@ def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
 
 
 def _find_inertial_base_parameters(table: Regressor) -> tuple[Identifiability, list[int]]:
-    """Find the base parameters of the inertial columns; return them and the columns' indices."""
+    """Find the base parameters of a regressor without friction.
+
+    Return their classification, and the indices of the columns of inertial parameters.
+    """
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
     rows = table.matrix[:, :, kept].reshape(-1, len(kept))
@@ -268,7 +279,10 @@ def _find_inertial_base_parameters(table: Regressor) -> tuple[Identifiability, l
 def _build_shared_parameter_matrix(
     bodies: Sequence[str], names: Sequence[str], equal_bodies: Sequence[Sequence[str]]
 ) -> np.ndarray:
-    """Return the matrix (190, m) that copies m distinct parameters to all bodies with equal parameters."""
+    """Return the matrix (190, m) that computes the parameters of all 19 bodies from m distinct ones.
+
+    The bodies of a group in `equal_bodies` share the parameters of its first body.
+    """
     first = {body: group[0] for group in equal_bodies for body in group}
     sums = np.zeros((len(bodies), len(names)))
     for k, name in enumerate(bodies):
@@ -296,7 +310,10 @@ def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> f
 
 
 def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Count the base parameters, and the combinations whose coefficients agree with Table 1."""
+    """Count the base parameters, and the combinations that agree with Abdellatif 2008, Table 1.
+
+    A combination agrees if it has the same members and coefficients.
+    """
     names, same = [structure.names[k] for k in structure.base], 0
     for symbol, members in printed.items():
         column = PUBLISHED_PARAMETERS[SYMBOLS.index(symbol)].column

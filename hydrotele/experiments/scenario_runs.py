@@ -42,7 +42,7 @@ def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
 
 
 def make_random_operator_settings(seed: int) -> dict[str, str]:
-    """Return scenario settings that draw a random operator of the published population and set the seed.
+    """Return scenario settings that draw a random simulated operator from its population and set the seed.
 
     Args:
         seed: seed of the operator and of the sensor noise.

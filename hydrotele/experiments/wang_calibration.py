@@ -54,7 +54,7 @@ POSE_LABEL = "pose [1]"
 
 
 def _draw_errors(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
-    """Draw errors before and after calibration; those after it also have an axis of their own."""
+    """Draw errors over poses before and after calibration; draw those after it also on a separate axis."""
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
         POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,
@@ -74,7 +74,7 @@ def _describe_before_and_after(samples: Sequence[Sample], name: str, unit: str =
 
 
 def measure_refined_model(seed: int, changes: Changes) -> Sample:
-    """Calibrate the 36 parameters of a robot's refined D-H model by least squares from 25 poses.
+    """Calibrate the 36 parameters of the IWR robot's refined D-H model by least squares from 25 poses.
 
     Args:
         seed: seed of the robot and the noise.
@@ -148,7 +148,7 @@ def _evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_poe_model(seed: int, changes: Changes) -> Sample:
-    """Calibrate all 54 parameters of a robot's product-of-exponentials (POE) model from 25 poses.
+    """Calibrate all 54 parameters of the IWR robot's product-of-exponentials (POE) model from 25 poses.
 
     Args:
         seed: seed of the robot and the noise.
@@ -207,7 +207,7 @@ def _describe_axes(samples: Sequence[Sample]) -> str:
 
 
 def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in all 54 parameters from 20 poses measured with wires.
+    """Calibrate a robot IWR with errors in all 54 parameters from 20 poses measured with wires.
 
     Args:
         seed: seed of the robot and the noise.

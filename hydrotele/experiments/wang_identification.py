@@ -80,11 +80,12 @@ def _downsample_posterior(posterior: Posterior) -> np.ndarray:
 
 
 def compare_posterior_with_null_space(seed: int, changes: Changes) -> Sample:
-    """Compare the sampled posterior of the 54 parameters with the null space of the Jacobian by QR.
+    """Compare the sampled posterior of a robot's 54 parameters with the null space of the Jacobian.
 
+    The parameters are the errors of the D-H model of the robot IWR; QR finds the redundant ones.
     The prior is normal with the standard deviations of the manufacturing errors. Along a parameter
-    direction with singular value s of the scaled Jacobian, the posterior standard deviation is
-    1 / sqrt(1 + s^2) times that of the prior.
+    direction with singular value s of the scaled Jacobian, the posterior standard deviation is 1 /
+    sqrt(1 + s^2) times that of the prior.
 
     Args:
         seed: seed of robot, noise and chains.
@@ -186,7 +187,9 @@ REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
 
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
-    """Compare the sampled posterior of the 36 refined parameters with their least-squares estimate.
+    """Compare the sampled posterior of 36 parameters of the robot IWR with their least-squares estimate.
+
+    They are the errors of the refined D-H model of Wang 2012.
 
     Args:
         seed: seed of robot, noise and chains.
@@ -244,7 +247,8 @@ def _evaluate_refined_posterior(samples: Sequence[Sample]) -> Evaluation:
 def count_independent_parameters(seed: int, changes: Changes) -> Sample:
     """Count the independent parameters of the error models, and calibrate 36 or all parameters of a robot.
 
-    All 54 parameters of the robot have errors.
+    The models of the robot IWR, D-H and POE, have 54 parameters, which all have errors; 36 is the
+    number of the refined model of Wang 2012.
 
     Args:
         seed: seed of robot and noise.
@@ -325,12 +329,12 @@ def _identify_by_differential_evolution(seed: int, changes: Changes, kind: Error
 
 
 def identify_dh_by_differential_evolution(seed: int, changes: Changes) -> Sample:
-    """Identify the 36 parameters of the D-H model by differential evolution from 15 poses."""
+    """Identify 36 parameters of a robot's D-H error model by differential evolution from 15 poses."""
     return _identify_by_differential_evolution(100 + seed, changes, "dh", 15)
 
 
 def identify_poe_by_differential_evolution(seed: int, changes: Changes) -> Sample:
-    """Identify 36 parameters of the POE model by differential evolution from 25 poses."""
+    """Identify 36 parameters of a robot's POE error model by differential evolution from 25 poses."""
     return _identify_by_differential_evolution(200 + seed, changes, "poe", 25)
 
 

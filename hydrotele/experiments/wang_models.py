@@ -57,7 +57,8 @@ MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above r
 def compare_carriage_kinematics(seed: int, changes: Changes) -> Sample:
     """Compare the carriage's D-H matrices with the printed position, Wang 2012, Eq. 7.
 
-    The parameter errors of carriage and hexapod are counted as well.
+    The carriage is the serial part of the robot IWR. The parameter errors of carriage and hexapod
+    are counted as well.
 
     Args:
         seed: seed of the poses.
@@ -116,7 +117,8 @@ def build_iwr_mechanism(straight: bool) -> Mechanism:
     P, R and S are prismatic, revolute and spherical joints.
 
     Args:
-        straight: whether the slide axes pass through both spherical joints, as in Wang Eq. 27.
+        straight: whether the slide axes pass through both spherical joints, as in Wang 2012, Eq.
+            27.
     """
     carriage = serial_mechanism("", (_SLIDE, _SLIDE, *_TWO_HINGES)).chains[0]
     legs = hexapod_mechanism("", (_BALL, _SLIDE, _BALL), (1, 2) if straight else ())
@@ -308,7 +310,7 @@ def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
 def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
     """Compare solutions of the forward kinematics by DE, Newton's method and the MuJoCo mechanism.
 
-    DE is differential evolution. One random pose is solved.
+    DE is differential evolution. One random pose of the robot IWR is solved.
 
     Args:
         seed: seed of pose and search.

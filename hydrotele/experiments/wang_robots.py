@@ -70,7 +70,7 @@ class SimulatedRobot(NamedTuple):
 def simulate_robot(
     seed: int, poses: int, kind: ErrorModelKind = "dh", refined_only: bool = True, noise: float = 1.0,
 ) -> SimulatedRobot:  # fmt: skip
-    """Simulate a robot with manufacturing errors and measure its poses with wires.
+    """Simulate a robot IWR with manufacturing errors and measure its poses with wires.
 
     The errors have standard deviations of 1 mm and 1 mrad.
 
@@ -78,7 +78,7 @@ def simulate_robot(
         seed: seed of errors, poses and noise.
         poses: number of poses for the calibration.
         kind: kind of the error model, D-H or POE.
-        refined_only: whether only the 36 parameters of the document's refined model have errors.
+        refined_only: whether only the 36 parameters of the refined model of Wang 2012 have errors.
         noise: factor of `SENSOR_NOISE`; 0 for exact measurements.
 
     Returns:
@@ -99,15 +99,15 @@ def simulate_robot(
 
 
 def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) -> Measurement:
-    """Simulate a measurement of the nominal robot without sensor noise.
+    """Simulate a measurement of the robot IWR without manufacturing errors and without sensor noise.
 
     Args:
         poses: number of poses.
         seed: seed of the poses.
-        tilt: largest tilt of the platform relative to the connecting platform [rad].
+        tilt: largest Euler angle of the platform from its home orientation [rad].
 
     Returns:
-        The measurement.
+        The measurement, whose platform poses are computed from wire lengths.
     """
     robot, wires = load_hybrid("iwr"), default_wires()
     joints, legs = sample_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)

@@ -37,7 +37,7 @@ _LOG_SEEDS = (11, 12)  # seeds of the logs for the fit and for the validation
 
 
 def _perturb_machine(machine: Machine) -> Machine:
-    """Return the machine with masses and dry friction multiplied by `_INITIAL_ERROR_FACTOR`."""
+    """Return the machine with masses and dry friction 1.3 times as large."""
     for name, link in machine.links.items():
         machine = with_value(machine, f"links.{name}.mass", _INITIAL_ERROR_FACTOR * link.mass)
     for name, axis in machine.axes.items():
@@ -77,7 +77,7 @@ def identify_feller_models(seed_offset: int) -> tuple[Machine, GravityModel]:
 def measure_false_force(seed: int, changes: Changes) -> Sample:
     """Estimate the endpoint force in free motion, where it is zero, with the static and the dynamic model.
 
-    The machine is at rest and then follows joint steps or joystick steps.
+    The feller-buncher is at rest and then follows joint steps or joystick steps.
 
     Args:
         seed: seed of operator and sensor noise.

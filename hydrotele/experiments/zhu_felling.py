@@ -255,9 +255,9 @@ def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
 
 
 def simulate_tip_over_protection(seed: int, changes: Changes) -> Sample:
-    """Simulate pressing with a target force of 60 kN, with and without the added tip-over spring.
+    """Simulate an operator who presses with 60 kN, with and without an added spring in the joystick.
 
-    Without this spring in the joystick, the force tips the machine.
+    The spring resists beyond half of the tipping moment. Without it, the force tips the excavator.
 
     Args:
         seed: seed of operator and sensor noise.

@@ -34,9 +34,10 @@ _DAMPING = 6.1  # 1/s
 
 
 def integrate_rising_damping(changes: Changes) -> Sample:
-    """Integrate a mass on a spring whose damping increases exponentially (4.6) or slowly (4.7).
+    """Integrate a mass on a spring whose damping increases exponentially or slowly.
 
-    With exponential damping the mass stops before it reaches its rest position.
+    The cases are those of Zhu 1994, (4.6) and (4.7). With exponential damping the mass stops before
+    it reaches its rest position.
 
     Args:
         changes: `stiffness`: K [1/s^2].
@@ -143,7 +144,7 @@ def integrate_varying_stiffness(damping, stiffness, position, speed, step, path)
 def sample_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw (count,) random stiffness values [1/s^2], constant between jumps at random times.
 
-    All values are within [K_min, K_max].
+    All values are within [K_min, K_max], 1 to 9 1/s^2.
     """
     jumps = rng.random(count) < _TIME_STEP / 10.0 ** rng.uniform(-1.5, 0.5)
     jumps[0] = True
@@ -237,7 +238,10 @@ def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_path_bounds(samples: Sequence[Sample]) -> Evaluation:
-    """Check that paths in the (x, x') plane stay between those of constant K_min and K_max."""
+    """Check that paths in the (x, x') plane stay between those of constant K_min and K_max.
+
+    The stiffness of the paths switches at random between these bounds (Zhu 1994, Figs 4.28, 4.29).
+    """
     return Evaluation((
         check_deterministic_value("largest distance by which a path lies outside",
                     float(collect_values(samples, "outside").max()), (0.0, 1e-3),
@@ -255,7 +259,10 @@ _PUBLISHED_GAINS = {
 
 
 def measure_published_gains(changes: Changes) -> Sample:
-    """Evaluate the stability condition (4.14) and the worst stiffness switching for the published gains.
+    """Evaluate a stability condition and the worst stiffness switching for the published joystick gains.
+
+    The condition is Zhu 1994, (4.14); the gains are those of Tables 6.7 and 6.9. The worst
+    switching is K_max towards the equilibrium and K_min away from it.
 
     Args:
         changes: `damping`: factor of the damping.
@@ -277,7 +284,11 @@ def measure_published_gains(changes: Changes) -> Sample:
 
 
 def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
-    """Check that no joystick axis satisfies (4.14) but all decay under the worst stiffness switching."""
+    """Check that no joystick axis satisfies a sufficient condition of stability, but all are stable.
+
+    The condition is Zhu 1994, (4.14). The motion must decay under the worst switching of the
+    stiffness.
+    """
     v = samples[0].values
     return Evaluation((
         check_deterministic_value("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],

@@ -37,12 +37,15 @@ def _compare_cylinder_areas(machine: Machine, printed: dict[str, tuple[float, fl
 
 
 def _compare_cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, float]]) -> TableEntries:
-    """Return the model's piston and rod diameters with the printed ones.
+    """Pair the model's piston and rod diameters with those printed in Zhu 1994.
 
     Args:
         machine: machine.
         printed: axis -> (number of cylinders that the model's cylinder represents, head diameter
             [mm], rod diameter [mm]).
+
+    Returns:
+        Name -> (value of the model, printed value, half of its last digit).
     """
     entries: TableEntries = {}
     for name, (count, head, rod) in printed.items():
@@ -56,7 +59,7 @@ def _compare_cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, 
 
 
 def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05) -> TableEntries:
-    """Return the model's pin distances of a two-bar linkage from its joint with the printed ones.
+    """Pair the model's pin distances of a two-bar linkage from its joint with those printed in Zhu 1994.
 
     Args:
         machine: machine.
@@ -64,6 +67,9 @@ def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: floa
         a: printed distance of one pin [mm].
         b: printed distance of the other pin [mm].
         half: half of the last printed digit [mm].
+
+    Returns:
+        Name -> (value of the model, printed value, half of its last digit).
     """
     axis = machine.axes[name]
     assert axis.cylinder is not None
@@ -82,13 +88,16 @@ def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: floa
 
 
 def _compare_four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float]) -> TableEntries:
-    """Return the model's dimensions of a four-bar linkage with the printed ones.
+    """Pair the model's dimensions of a four-bar linkage with those printed in Zhu 1994.
 
     Args:
         machine: machine.
         name: axis.
         closure: closure of the linkage.
         printed: printed r1, r2, r3, r4 [mm], gamma, alpha [rad], L [mm].
+
+    Returns:
+        Name -> (value of the model, printed value, half of its last digit).
     """
     axis = machine.axes[name]
     assert axis.cylinder is not None and axis.four_bar is not None
@@ -173,9 +182,10 @@ def _compare_joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) ->
 
 
 def _compare_force_limits(name: str, force: float) -> TableEntries:
-    """Return the model's largest reflected forces with the printed ones.
+    """Pair the model's largest reflected forces with those printed in Zhu 1994.
 
-    The latter are `force` [kN] in translation and 40 kN m in rotation.
+    The latter are `force` [kN] in translation and 40 kN m in rotation. The result is axis -> (value
+    of the model, printed value, half of its last digit).
     """
     return {
         axis: (gains.force_limit / 1e3, force if len(axis) == 1 else 40.0, 0.5)

@@ -53,7 +53,7 @@ def sample_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
 
 
 def measure_transparency(changes: Changes) -> Sample:
-    """Compute transparency, passivity and stability of the four-channel structure under position control.
+    """Compute transparency, passivity and stability of a four-channel teleoperator under position control.
 
     Args:
         changes: `mass_error`: relative error of the slave's mass; `delay`: delay each way [s].
@@ -87,7 +87,10 @@ def measure_transparency(changes: Changes) -> Sample:
 
 
 def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the four-channel hybrid matrix is [[0, 1], [-1, 0]] and the position error decays."""
+    """Check that a four-channel teleoperator transmits force and velocity unchanged (Zhu 1994, p. 39).
+
+    Its hybrid matrix must be [[0, 1], [-1, 0]], and the position error of the slave must decay.
+    """
     v = samples[0].values
     return Evaluation((
         check_deterministic_value("largest difference of the hybrid matrix from [[0, 1], [-1, 0]], relative to"
@@ -98,7 +101,7 @@ def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the four-channel two-port has scattering norm 1 and is stable with any passive hand and task."""
+    """Check that the four-channel teleoperator has scattering norm 1 and is stable with any passive hand and task."""
     v = samples[0].values
     return Evaluation((
         check_deterministic_value("largest scattering norm", v["norm"], (1.0 - 1e-9, PASSIVE_NORM), "1 (3.33)",
@@ -155,7 +158,10 @@ def measure_intervening_impedance(changes: Changes) -> Sample:
 
 
 def evaluate_intervening_impedance(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the operator feels the sum of master and task impedance (3.39), and that loops are stable."""
+    """Check that the operator feels the sum of master and task impedance and that loops are stable.
+
+    This is Zhu 1994, (3.39), for four channels and identical sides with added damper and spring.
+    """
     v = samples[0].values
     return Evaluation((
         check_deterministic_value("largest relative difference of the felt impedance and Z_m + Z_e (3.39)",
@@ -277,7 +283,8 @@ def measure_felt_impedance_extremes(changes: Changes) -> Sample:
 def evaluate_felt_impedance_extremes(samples: Sequence[Sample]) -> Evaluation:
     """Check that the impedance felt for very stiff and very soft tasks does not depend on the task.
 
-    It must be that of (3.50) and (3.51), which contain only master and slave.
+    It must be that of Zhu 1994, (3.50) for stiff and (3.51) for soft tasks, which contain only
+    properties of master and slave.
     """
     v, reason = samples[0].values, "the task is 10^8 times stiffer or softer; 10^-4 remains"
     return Evaluation((
@@ -287,7 +294,7 @@ def evaluate_felt_impedance_extremes(samples: Sequence[Sample]) -> Evaluation:
 
 
 def build_rate_control_port(case: TeleoperatorAxis, velocity_gain: float = 1.0) -> TwoPort:
-    """Return the practical four-channel two-port under rate control, Zhu 1994, (3.59).
+    """Return the four-channel two-port under rate control, Zhu 1994, (3.59).
 
     Args:
         case: master and slave with damper and spring added to their masses.
@@ -327,9 +334,10 @@ def measure_rate_transparency(changes: Changes) -> Sample:
 
 
 def evaluate_rate_transparency(samples: Sequence[Sample]) -> Evaluation:
-    """Check that under rate control the operator feels master plus task impedance (3.61).
+    """Check that under rate control the operator feels the sum of master and task impedance.
 
-    The slave's velocity must be proportional to the master's position (3.64).
+    The slave's velocity must be proportional to the master's position. These are Zhu 1994, (3.61)
+    and (3.64).
     """
     v = samples[0].values
     return Evaluation((
@@ -374,7 +382,8 @@ def measure_stability_without_damping(changes: Changes) -> Sample:
 def evaluate_stability_without_damping(samples: Sequence[Sample]) -> Evaluation:
     """Check that rate control without damping of the master is unstable.
 
-    Both the polynomial (3.72) and the whole loop without a hand must have unstable poles.
+    Both the characteristic polynomial of the master (Zhu 1994, (3.72)) and the whole loop without a
+    hand must have unstable poles.
     """
     v = samples[0].values
     return Evaluation((

@@ -118,7 +118,10 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
 
 
 def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the formulas of hybrid matrix (3.11) and felt impedance (3.12) solve the equations."""
+    """Check that the formulas of hybrid matrix and felt impedance agree with a numerical solution.
+
+    The formulas are Zhu 1994, (3.11) and (3.12), for the general two-port structure.
+    """
     values, reason = samples[0].values, "rounding: two solutions of the same equations"
     return Evaluation((
         check_deterministic_value("largest relative error of the hybrid matrix (3.11)", values["matrix"],
@@ -247,7 +250,10 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the position-position structure has the hybrid matrix of two masses joined by a spring."""
+    """Check that the position-position structure has the hybrid matrix of two masses that are joined.
+
+    A spring and a damper join them.
+    """
     return Evaluation((
         check_deterministic_value("largest relative difference of the hybrid matrices",
                     samples[0].values["difference"], ROUNDING_RANGE, "rounding"),
@@ -261,7 +267,7 @@ def measure_contact_position_error(seed: int, changes: Changes) -> Sample:
     """Compare the position error due to a contact force with the measurement noise.
 
     The excavator presses with 20 kN under stiffness feedback. The joystick's stiffness is also
-    compared with (4.1).
+    compared with the law of Zhu 1994, (4.1).
 
     Args:
         seed: seed of operator and sensor noise.
@@ -380,7 +386,8 @@ def measure_impedance_difference(changes: Changes) -> Sample:
         changes: `transparent`: 1 for the transparent four-channel structure.
 
     Returns:
-        Largest relative difference of each of three structures that are not transparent.
+        Largest relative difference of the position-position, the position-force and the rate-force
+        structure.
     """
     given = merge_settings({"transparent": 0.0}, changes)
     case, s, values, curves = load_shipped_case(), 1j * HAND_FREQUENCIES, {}, {}

@@ -196,8 +196,9 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
     The wrench follows from the joystick's control law and the machine's latest packet.
 
     Args:
-        buffers: LinkBuffers with the received `pose`. `reply`, `count` and `ramp` are written.
-        mailbox: Mailbox; the handle's part and `state` are written.
+        buffers: LinkBuffers with the received packet in `pose`. The wrench packet is written to `reply`;
+            counters and force ramp are updated.
+        mailbox: Mailbox; the handle's pose and the state of the control law are written to it.
         now: arrival time, scalar [ns].
         timespec: (2,) work space of the clock.
 
@@ -263,10 +264,11 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
 
 @compiled
 def _compute_reflected_force(line, box, now, two, first, period):
-    """Write the handle's pose into the mailbox and compute the force on the handle.
+    """Write the handle's pose into the mailbox and compute the force on the handle by the control law.
 
-    The force is stored in `box.state`. Without data from the machine or a valid pose, its factor
-    `line.ramp[FORCE_GAIN]` is 0.
+    The force is stored in the state of the control law, `box.state`. The caller multiplies it by
+    `line.ramp[FORCE_GAIN]`, which is 0 without data from the machine or without a valid pose, and
+    otherwise rises to 1.
     """
     real = line.pose_real
     scale = line.reach[0] / real[TRAVEL] if real[TRAVEL] > 0.0 else 0.0
@@ -372,10 +374,11 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
         mail: (1,) record with the addresses of the mailbox arrays and of the dead bands.
         qpos: (7,) written: handle position in joystick scale [m] and quaternion; NaN if the result is
             false.
-        packet: (rows, k) packet from the machine.
-        packet_gain: factor on the packet, scalar.
+        packet: (rows, k) packet from the machine: forces and motion of its tip.
+        packet_gain: factor 0 to 1 on the reflected force, scalar.
         extra: (6,) additional force on the handle [N], [N m].
-        engaged: whether the handle has been in its dead bands, scalar.
+        engaged: whether the handle has been in the dead bands of all axes since its pose became valid,
+            scalar.
         now: current time, scalar [ns].
 
     Returns:
@@ -493,8 +496,8 @@ class HapticLink:
         Args:
             qpos: (7,) written: handle position in joystick scale [m], quaternion; NaN while no
                 device is connected, or until the handle has returned to its dead bands.
-            packet: packet from the machine.
-            packet_gain: factor on the packet.
+            packet: packet from the machine: forces and motion of its tip.
+            packet_gain: factor 0 to 1 on the reflected force.
             extra: (6,) additional force on the handle [N], [N m].
         """
         now = clock.monotonic_ns()
@@ -517,7 +520,7 @@ class HapticLink:
         """Return statistics of the connection.
 
         They contain the counts of received, lost, late and malformed poses, server starts and periods that
-        the device missed. Answer, round-trip and interval times are as from `summarise_durations`.
+        the device missed. Answer, round-trip and interval times are given as percentiles and histogram.
         """
         line, count = self.buffers, self.buffers.count
         return {

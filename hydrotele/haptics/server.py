@@ -189,7 +189,7 @@ class DeviceSession:
         return True
 
     def _rejection_reason(self, data, sender: Address) -> str:
-        """Return the reason to reject a packet, or an empty string; parse it into `_answer`."""
+        """Return the reason to reject a packet, or an empty string; copy the packet to `_answer`."""
         if len(data) != 8 * WRENCH_WORDS:
             return "malformed"
         self._answer.byte_view[:] = data
@@ -252,7 +252,11 @@ def run_device_server(
 def _run_server_periods(
     line: socket.socket, exchange: DeviceSession, period: float, over: Callable[[], bool]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Run one period after the other; return start delays [ns], answer times [ns], period count."""
+    """Run one period after the other until `over()` is true.
+
+    Return the delays of the starts of the periods [ns], the times from sending a pose to receiving its
+    answer [ns], and the number of periods.
+    """
     wake, trips = np.zeros(_MAX_SAMPLES, np.int64), np.zeros(_MAX_SAMPLES, np.int64)
     step, spin, now = round(1e9 * period), round(1e9 * BUSY_WAIT_TIME), clock.monotonic_ns
     count = answers = 0

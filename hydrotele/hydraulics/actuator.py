@@ -48,7 +48,7 @@ def actuator_friction(user, u, velocity):
     Returns:
         Friction force, scalar [N] or [N m], with the sign of the velocity.
 
-    Source: nominal model, "Piston force"; formula of `laws.friction_force`.
+    Source: models/cat215/README.md, "Force"; formula of `laws.friction_force`.
     """
     return friction_force(
         velocity,
@@ -74,7 +74,7 @@ def actuator_friction_slope(user, u, velocity):
     Returns:
         dF_f/dv, scalar [N s/m] or [N m s/rad].
 
-    Source: derivative of the nominal model's "Piston force".
+    Source: derivative of "Force" in models/cat215/README.md.
     """
     return friction_slope(
         velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _V0],
@@ -96,7 +96,7 @@ def actuator_end_stop_force(user, u, position, velocity):
         (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
         [N s/m] or [N m s/rad]); all 0 between the stops.
 
-    Source: `laws.stop_force`.
+    Source: `laws.end_stop_force`.
     """
     if user[u + _STOP_STIFFNESS] == 0.0:
         return 0.0, 0.0, 0.0
@@ -177,7 +177,7 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
     Returns:
         Force, scalar [N].
 
-    Source: nominal model, "Piston force", with the friction of `pump_piston_friction`.
+    Source: models/cat215/README.md, "Force", with the friction of `pump_piston_friction`.
     """
     force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_cylinder_force(user, u + PUMP_OFFSET, p_load)
     seal = (
@@ -204,7 +204,7 @@ def force_after_friction(user, u, drive_force, other_force, act, velocity, dt):
         (force [N] or [N m], dF_f/dv [N s/m] or [N m s/rad]). For an axis with its own pump the
         friction is that at the end of the step, and the slope is 0.
 
-    Source: nominal model, "Piston force".
+    Source: models/cat215/README.md, "Force".
     """
     if user[u + _KIND] == _PUMPED:
         return pump_drive_force(user, u, act[1], act[2], act[3], velocity, other_force, dt), 0.0
@@ -233,7 +233,7 @@ def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     Returns:
         g, scalar [N] or [N m], with the sign of the velocity; positive at rest.
 
-    Source: nominal model, "Piston force".
+    Source: models/cat215/README.md, "Force".
 
     >>> sliding_friction(-1.0, 3000.0, 1500.0, 0.02, 0.0)
     -3000.0
@@ -361,7 +361,9 @@ def bristle_friction(user, u, fraction, velocity, inertia, dt):
 
 @compile_without_allocation
 def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia, dt):
-    """Return the friction of an actuator with bristles at the end of an implicit step of a free body.
+    """Return the presliding (bristle) friction on a body at the end of an implicit time step.
+
+    Only this friction, taken at the new velocity, and `other_force` act on the body.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.

@@ -135,7 +135,7 @@ def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahea
     with bulk modulus beta, volumes V, valve flows q, areas A, piston leakage q_l, and flows r of port
     relief, make-up valve and terms. A hose of compliance C_h counts as additional volume `beta C_h`, and
     air bubbles in the oil as beta times their compliance (`laws.air_compliance`). Beyond an end of the
-    stroke the volumes are constant. The rates are those without released air; `laws.pressure_with_air`
+    stroke the volumes are constant. The rates are those without released air; `laws.pressure_with_released_air`
     converts pressures below atmosphere.
 
     Args:
@@ -155,7 +155,7 @@ def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahea
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
 
-    Source: nominal model, "Chambers".
+    Source: models/cat215/README.md, "Chambers".
     """
     if user[u + _KIND] == _PUMPED:
         return pump_drive_pressure_rates(user, u, opening, p_head, p_rod, x, v, added)
@@ -203,7 +203,8 @@ def _term_flows(terms, i, user, time, x, oil, supply, drives):
 def _term_flow_fraction(user, first, drives, terms, time, supply, dt):
     """Return the flow that terms add to the supply at the end of a step, per maximum pump flow [1].
 
-    It follows the terms' values at the start of the step with a first-order lag.
+    Terms are additional laws of a machine. The flow follows their sum at the start of the step with a
+    first-order lag.
     """
     at = int(user[first * SLOT_COUNT + _ADDED])
     if at == 0:
@@ -230,7 +231,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
     Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
     except for the supply, which couples all fed chambers (`compute_supply_pressure_derivatives`, solved by the
     Sherman-Morrison formula). The supply pressure is solved in both stages. Below atmosphere the
-    method integrates the pressure P without released air (`laws.pressure_without_air`), which is
+    method integrates the pressure P without released air (`laws.pressure_without_released_air`), which is
     linear in the missing oil volume. A pump with a time constant follows the mean of the flow
     demands at both ends of the step, by its exact exponential.
 
@@ -254,7 +255,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
 
-    Source: nominal model; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
+    Source: models/cat215/README.md; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
     """
     gamma_h = _ROS2_GAMMA * dt
     count, act, length, velocity, command = drives
@@ -448,10 +449,11 @@ def _predicted_softening(user, u, pressure, rate, dt):
 def _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
     """Prepare the Sherman-Morrison solution of the stage equations that the supply couples.
 
-    The stage equations are `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per
-    supply pressure and w = dp_s/dp. Index 2 of the factors of every axis gets
-    `gamma h b / (1 - gamma h D)` over the common divisor `1 - gamma h w^T b / (1 - gamma h D)`,
-    negative if the rod side is fed. Index 3 gets w times the softening of the fed chamber.
+    The stage equations of ROS2 are `(I - gamma h (D + b w^T)) k = r` for the pressure rates k, with step h
+    and coefficient gamma. D is diagonal, b the pressure rates per supply pressure and w = dp_s/dp. Index 2
+    of the four factors of every axis (in `scratch`) gets `gamma h b / (1 - gamma h D)` over the common
+    divisor `1 - gamma h w^T b / (1 - gamma h D)`, negative if the rod side is fed. Index 3 gets w times
+    the softening of the fed chamber by released air.
     """
     divisor = 1.0
     for i in range(count):
@@ -506,7 +508,7 @@ def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
     Returns:
         (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]).
 
-    Source: nominal model, "Orifice" and "Piston force".
+    Source: models/cat215/README.md, "Orifice" and "Force".
     """
     u = i * SLOT_COUNT
     if user[u + _KIND] == _PUMPED:
@@ -532,9 +534,10 @@ _RELATIVE_TOLERANCE = 1.0e-13
 
 @compile_without_allocation
 def implicit_friction(user, u, velocity, other_force, inertia, dt):
-    """Return the friction of an actuator at the end of an implicit step of a free body.
+    """Return the friction on a body at the end of an implicit time step, without bristles.
 
-    Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
+    Only the friction F_f of the actuator and the force F act on the body. The function
+    solves `v' = v + dt / J (F - F_f(v'))` for the velocity v' at the end by Newton's method in a bracket.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
@@ -604,10 +607,10 @@ def make_drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
 @compile_without_allocation
 def add_command_terms(user, terms, drives, dt, time, scratch, out):
-    """Add the terms that act on commands to the commands of the valves, evaluated at the middle of a step.
+    """Add those terms (additional laws) of a machine that change commands to the commands of the valves.
 
-    Positions and time are those at the middle of the step. Spools and pressures are those at its
-    start; their effect on a command is therefore late by half a step.
+    The terms are evaluated with positions and time at the middle of the step, and with spools and pressures
+    at its start; their effect on a command is therefore late by half a step.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
@@ -622,7 +625,7 @@ def add_command_terms(user, terms, drives, dt, time, scratch, out):
     Returns:
         Nothing.
 
-    Source: docs/effects.md, "The term": the balance `command`.
+    Source: docs/effects.md, "The term": terms whose `balance` is `command`.
     """
     count, act, length, velocity, command = drives
     if not has_term(terms, COMMAND, ANY_DRIVE):

@@ -1,8 +1,7 @@
 """Laws of valve, orifice, chamber, friction and end stop, in SI, as small compiled functions.
 
 The native callbacks, the tests and the identification use the same functions. Equations: Merritt,
-*Hydraulic Control Systems* (1967); the "nominal model" of the sources is described in
-`models/cat215/README.md`.
+*Hydraulic Control Systems* (1967), and `models/cat215/README.md`.
 
 The valve functions read the parameters of an axis from its actuator parameters. In the positive
 direction the valve meters P-A into the head side and B-T out of the rod side, in the negative
@@ -32,7 +31,7 @@ def valve_opening(spool, deadband):
     Returns:
         Opening o, scalar [1]: `sgn(s) (|s| - db) / (1 - db)` outside the dead band, else 0.
 
-    Source: nominal model, "Spool".
+    Source: models/cat215/README.md, "Spool".
 
     >>> valve_opening(1.0, 0.04)
     1.0
@@ -59,7 +58,7 @@ def orifice_flow(pressure_drop, flow_gain, smoothing):
     Returns:
         (flow q [m^3/s] with the sign of the pressure drop, slope dq/d(dp) [m^3/(s Pa)] > 0).
 
-    Source: nominal model, "Orifice".
+    Source: models/cat215/README.md, "Orifice".
 
     >>> flow, slope = orifice_flow(7.0e6, 6.0e-3 / 7.0e6**0.5, 5.0e4)
     >>> round(flow, 7)
@@ -90,7 +89,7 @@ def relief_and_makeup_flow(pressure, port_relief, relief_gain, tank_pressure, ma
     Returns:
         (flow into the chamber [m^3/s], d flow / d p [m^3/(s Pa)] <= 0).
 
-    Source: nominal model, "Chambers".
+    Source: models/cat215/README.md, "Port relief and make-up".
 
     >>> relief_and_makeup_flow(33.0e6, 32.0e6, 1.0e-9, 0.3e6, 5.0e-9)
     (-0.001, -1e-09)
@@ -121,7 +120,7 @@ def pressure_with_released_air(air_free_pressure, release, onset=0.0):
     Returns:
         p, scalar [Pa] above atmosphere; equal to P if P >= -onset.
 
-    Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" of the nominal model.
+    Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" in models/cat215/README.md.
 
     >>> round(pressure_with_released_air(-1.0e8, 1.35e8))
     -43106
@@ -299,7 +298,7 @@ def friction_force(
     Returns:
         Friction force, scalar [N] or [N m], with the sign of the velocity.
 
-    Source: nominal model, "Piston force" and "Swing motor".
+    Source: models/cat215/README.md, "Force" and "Swing and grapple motors".
 
     >>> round(friction_force(1.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005), 6)
     9000.0
@@ -332,7 +331,7 @@ def friction_slope(
     Returns:
         Derivative, scalar [N s/m] or [N m s/rad].
 
-    Source: derivative of the nominal model's "Piston force".
+    Source: derivative of "Force" in models/cat215/README.md.
 
     >>> friction_slope(0.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005)
     906000.0
@@ -372,7 +371,7 @@ def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.
     Returns:
         (s, s') at the end of the step.
 
-    Source: nominal model, "Spool".
+    Source: models/cat215/README.md, "Spool".
 
     >>> s, rate = spool_step(0.0, 0.0, 1.0, 50.0, 0.9, 1.0e-3)
     >>> round(s, 6)
@@ -449,7 +448,7 @@ def inlet_gain(user, u, opening):
     Returns:
         Flow per root of the pressure drop of the edge P-A (o > 0) or P-B, scalar [m^3/(s sqrt(Pa))].
 
-    Source: nominal model, "Orifice".
+    Source: models/cat215/README.md, "Orifice".
     """
     edge = user[u + _PA] if opening > 0.0 else user[u + _PB]
     return user[u + _K] * edge * abs(opening)
@@ -541,7 +540,7 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
 
-    Source: nominal model, "Orifice"; Merritt 1967, laminar flow through an annular clearance.
+    Source: models/cat215/README.md, "Orifice"; Merritt 1967, laminar flow through an annular clearance.
     """
     q_head, q_rod, slope_head, slope_rod = _edge_flows(user, u, opening, p_supply, p_head, p_rod)
     if user[u + _TANK_LEAK] == 0.0:

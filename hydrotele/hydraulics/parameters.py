@@ -101,7 +101,7 @@ CURVE_SIZE = 1 + 2 * CURVE_KNOTS  # number of parameters of one flow curve
 
 
 class PumpSlot(enum.IntEnum):
-    """Indices of a pump drive's parameters in its block, all in SI units."""
+    """Indices of a pump drive's parameters, counted from PUMP_OFFSET after its first parameter; SI units."""
 
     DISPLACEMENT = 0
     LEAKAGE = 1
@@ -228,7 +228,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
 def machine_terms_table(machine: Machine) -> np.ndarray:
     """Return the additional force and flow laws (terms) of a machine as an array for compiled code.
 
-    See `terms.table.terms_table` for its layout.
+    See `terms.table.encode_terms_table` for its layout.
     """
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]

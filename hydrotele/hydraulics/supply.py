@@ -46,7 +46,7 @@ def solve_supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0,
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply"; droop: leakage proportional to the pressure (Merritt 1967);
+    Source: models/cat215/README.md, "Supply"; droop: leakage proportional to the pressure (Merritt 1967);
         override: static characteristic of a direct-acting relief valve, linear in its flow.
 
     >>> import numpy as np
@@ -96,11 +96,13 @@ def solve_supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0,
 
 @compile_inlined
 def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate):
-    """Compute, for the supply pressure, valve opening, inlet gain and fed chamber pressure of every axis.
+    """Compute the valve opening, inlet gain and fed chamber pressure of every axis.
+
+    They are written to `ports`, from which the functions of this module compute the supply pressure.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
-        act: (4 count,) activations; pressures [Pa].
+        act: (4 count,) activations; of each axis only the pressures at indices 2 and 3 are read [Pa].
         spool: (4 count,) array with the spool position of every axis at index 0 of its four [1].
         ports: (>= 4 count,) written, four values per axis: inlet gain [m^3/(s sqrt(Pa))], fed chamber
             pressure [Pa], pressure drop set by the compensator [Pa], opening [1]. The last is the pump
@@ -113,7 +115,7 @@ def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate)
     Returns:
         Nothing.
 
-    Source: nominal model, "Orifice".
+    Source: models/cat215/README.md, "Orifice".
     """
     for i in range(count):
         u = (first + i) * SLOT_COUNT
@@ -131,9 +133,9 @@ def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate)
 
 @compile_without_allocation
 def delivered_flow_fraction(user, first, act):
-    """Return the fraction of its maximum flow that the pump delivers, including terms.
+    """Return the fraction of its maximum flow that the pump delivers, including the flow that terms add.
 
-    It is 1 for a pump without time constant and without terms.
+    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant and terms.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
@@ -154,9 +156,10 @@ def delivered_flow_fraction(user, first, act):
 
 @compile_without_allocation
 def pump_flow_fraction(user, first, act):
-    """Return the fraction of its maximum flow that the pump itself delivers, without terms.
+    """Return the fraction of its maximum flow that the pump delivers, without the flow that terms add.
 
-    It is 1 for a pump without time constant; otherwise it is a state of the simulation.
+    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant;
+    otherwise it is a state of the simulation.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
@@ -176,7 +179,7 @@ def pump_flow_fraction(user, first, act):
 
 @compile_without_allocation
 def add_flow_fractions(fraction, added):
-    """Add the contribution of terms to a pump's flow fraction, with a positive lower bound.
+    """Add to a pump's flow fraction that of the machine's terms (additional laws), bounded below by > 0.
 
     Args:
         fraction: flow fraction without terms, scalar [1].
@@ -215,22 +218,21 @@ def demanded_flow_fraction(user, first, count, ports):
     """Return the fraction of the maximum pump flow that the valves demand.
 
     `q = (sum_i q_i + c_p p_s) / Q_pump` with valve flows q_i, pump leakage c_p and maximum flow Q_pump,
-    at the pressure p_s of a pump without time constant. A pump with time constant T delivers at most
-    the fraction r with `T dr/dt = q - r`. While its
-    displacement increases, the pressure drops until the valves draw no more than that. While it
-    decreases, the excess flow passes the relief or unloading valve.
+    at the pressure p_s that a pump without time constant would maintain. A pump with time constant T
+    delivers at most the fraction r with `T dr/dt = q - r`. While r rises, the pressure drops until the
+    valves draw no more than that. While r falls, the excess flow passes the relief or unloading valve.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_inlet_conditions` writes them.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
+            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
 
     Returns:
         q, scalar [1], 0 .. 1.
 
-    Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
+    Source: models/cat215/README.md, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
     """
     supply = circuit_supply_pressure(user, first, count, ports, 1.0)
     return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOT_COUNT + _PUMP])
@@ -244,14 +246,14 @@ def drawn_flow(user, first, count, ports, supply):
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_inlet_conditions` writes them.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
+            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
         supply: p_s, scalar [Pa].
 
     Returns:
         `sum_i q_i + c_p p_s` with valve flows q_i and leakage coefficient c_p, scalar [m^3/s].
 
-    Source: nominal model, "Supply".
+    Source: models/cat215/README.md, "Supply".
     """
     s = first * SLOT_COUNT
     drawn = user[s + _DROOP] * supply
@@ -264,14 +266,16 @@ def drawn_flow(user, first, count, ports, supply):
 
 @compile_inlined
 def max_supply_pressure(user, first, count, ports):
-    """Return the upper limit of the supply pressure: relief setting or load-sensing pressure.
+    """Return the upper limit of the supply pressure: the setting of the relief valve.
+
+    For a load-sensing pump it is at most the largest fed chamber pressure (or tank pressure) plus the margin.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_inlet_conditions` writes them.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
+            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
 
     Returns:
         p_s, scalar [Pa].
@@ -300,14 +304,14 @@ def circuit_supply_pressure(user, first, count, ports, fraction):
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_inlet_conditions` writes them.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
+            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
         fraction: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply".
+    Source: models/cat215/README.md, "Supply".
     """
     s, most = first * SLOT_COUNT, max_supply_pressure(user, first, count, ports)
     flow = user[s + _PUMP] * fraction
@@ -328,16 +332,16 @@ def compute_supply_pressure_derivatives(user, first, count, ports, supply, out):
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
-            opening [1] of every axis, as `compute_inlet_conditions` writes them.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
+            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
         supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].
 
     Returns:
-        Whether any dp_s/dp_i is not 0, scalar [1].
+        Whether any dp_s/dp_i is not 0, scalar [1]; otherwise `out` may be unchanged.
 
-    Source: implicit function theorem on "Supply" of the nominal model.
+    Source: implicit function theorem on "Supply" of models/cat215/README.md.
     """
     s, total, leader = first * SLOT_COUNT, user[first * SLOT_COUNT + _DROOP], -1
     most, load = user[s + _RELIEF], user[s + _TANK]

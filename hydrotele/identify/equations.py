@@ -48,10 +48,11 @@ class Equations:
             [N m]; NaN where unknown.
         time: (n,) time from the start of the run [s].
         spacing: time between equations [s]; an integer fraction of a repeated motion's period.
-        friction_sign_uncertainty: (n, k) uncertainty of the sign of the drives' dry friction, 0 .. 1.
+        friction_sign_uncertainty: (n, k) uncertainty of the sign of the drives' dry friction, caused by
+            errors of the speed: 0 for a certain sign, 1 for an unknown one.
         force_noise: (k,) standard deviation of the filtered force noise; NaN if unknown.
-        motion_noise: (k, m, m) second moments of the force errors per parameter that errors of the
-            motion cause; see `noise_rms`. Empty if not requested.
+        motion_noise: (k, m, m) matrices M of the regressor errors that errors of the motion cause. With
+            parameters p, p' M p is the mean squared force error of a drive. Empty if not requested.
     """
 
     name: str
@@ -101,16 +102,16 @@ def build_equations(
         record: the run.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
-        position_resolution: resolution of the positions.
-        with_noise: whether to compute `motion_noise`, and to downsample less.
-        rate_errors: rate errors of the measured joints, if these are not the joints of the record;
-            by default the joints of the record, with independent errors.
+        position_resolution: noise and bandwidth of the positions.
+        with_noise: whether to compute `Equations.motion_noise`, and to keep more equations.
+        rate_errors: errors of the speeds of the sensed joints, if the record has other joints; by
+            default those of the joints of the record.
 
     Returns:
         The equations, and a regressor without rows that has names, units and nominal values.
 
     Raises:
-        InputError: the run is too short for the band, or the mechanism cannot follow it.
+        InputError: the run is too short for the low-pass filter, or closed loops cannot follow the motion.
     """
     band = processing.band or position_resolution.band
     motion = _compute_motion(record, position_resolution, processing)
@@ -184,8 +185,8 @@ def _compute_regressor_error_moments(
 ) -> np.ndarray:  # fmt: skip
     """Return second moments (k, m, m) of regressor errors of k drives caused by motion errors.
 
-    With parameters p, p' M_k p is the mean squared force error of drive k. Possible true motions are
-    sampled about that of the optimal smoother.
+    With parameters p, p' M_k p is the mean squared force error of drive k. The regressor of the filtered
+    motion is compared with those of random motions that the measured positions allow.
     """
     rows = slice(0, max(_MAX_NOISE_ROWS, 4 * len(low)))
     smoothed = smooth_and_differentiate(record.position[rows], record.period, position_resolution.noise)
@@ -213,7 +214,7 @@ def predict_forces(
         rate_std: (n, k) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
     Returns:
-        (n, k) forces [N] or [N m], including stated damping and springs of the joints.
+        (n, k) forces [N] or [N m], including the known damping and springs of the joints, which are no parameters.
     """
     out, start = [], None
     for first in range(0, motions.shape[1], _ROWS_PER_CHUNK):
@@ -239,8 +240,8 @@ def _evaluate_regressor_rows(
         start: (v,) joint positions near those of the first row, or None.
 
     Returns:
-        The regressor, the uncertainty (n, drives) of the sign of dry friction, the drive forces (n,
-        drives) of stated damping and springs, and the joint positions (v,) of the last row.
+        Four items: the regressor; the uncertainty (n, drives) of the sign of dry friction; the drive forces
+        (n, drives) of the joints' known damping and springs; the joint positions (v,) of the last row.
     """
     chain = setup.chain
     found = setup.project_motion_on_drives(*motions, start=start)

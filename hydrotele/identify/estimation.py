@@ -41,10 +41,11 @@ class Estimate:
         residual: (n, k) measured minus predicted force [N] or [N m].
         gain: (p, n, k) derivative of the estimates with respect to each force; 0 for omitted rows.
         condition: condition number of the weighted, scaled equations.
-        whitening: (k, k) matrix that weighted the equations.
-        inverse_normal_matrix: (p, p) inverse N of the weighted normal equations: with weighted Y (or Z)
-            and F, `value = prior + N Y' (F - Y prior)`.
-        rank: number of directions left by truncation.
+        whitening: (k, k) matrix by which the equations of each row were multiplied.
+        inverse_normal_matrix: (p, p) inverse N of the normal equations. With weighted regressor Y and
+            forces F, `value = prior + N Y' (F - Y prior)`; with instruments, they replace Y'.
+        rank: number of parameter combinations that the data determine: those whose singular values
+            were not truncated.
     """
 
     value: np.ndarray
@@ -79,7 +80,8 @@ class Estimate:
     def squared_distance(self, parameters: np.ndarray) -> float:
         """Return the squared Mahalanobis distance of other parameters (p,) from the estimate.
 
-        Its distribution is chi^2 with `rank` degrees of freedom. Truncated directions are excluded.
+        Its distribution is chi^2 with `rank` degrees of freedom. Combinations of parameters whose singular
+        values were truncated are excluded.
         """
         away = (np.asarray(parameters) - self.value) / self.std
         values, ways = np.linalg.eigh(self.covariance / np.outer(self.std, self.std))
@@ -98,7 +100,7 @@ def estimate_linear_parameters(
     drive is weighted by its residuals. An autoregression of the residuals models their correlation
     in time. It increases the covariance but does not change the estimate, because prewhitened
     equations would give most weight to fast changes, where models and derivatives are least
-    accurate. With instruments Z the estimate solves `Z' W (F - Y p) = 0`, which is not biased by
+    accurate. With instruments Z and weights W the estimate solves `Z' W (F - Y p) = 0`. It is not biased by
     noise in Y as long as Z is independent of that noise. With few rows relative to the correlation
     time the intervals are too narrow. For 400 rows with a correlation of 80 % between successive
     errors, 93 % of them cover the truth. Ridge and truncation move poorly determined
@@ -179,8 +181,8 @@ def _solve_with_drive_weights(
     If requested, the drives are weighted by their residuals and the equations solved again.
 
     Returns:
-        Estimates (p,), their derivative with respect to the forces (p, n, k), the solution
-        properties, and the scales (k,) of the drives.
+        Four items: estimates (p,); their derivative by the forces (p, n, k); solution properties; the RMS
+        residuals (k,) by which the equations of each drive were divided, 1 without weights.
     """
     value, inverse, solved = _solve_once(x, y, z, shape)
     ones = np.ones(y.shape[1])
@@ -260,7 +262,7 @@ def fit_autoregression(error: np.ndarray, order: int | None = None) -> np.ndarra
 
 
 def _pseudo_inverse(x: np.ndarray, ridge: float, truncation: float) -> tuple[np.ndarray, _SolutionProperties]:
-    """Return the pseudo-inverse (p, N) of x (N, p), regularised by ridge and truncation, and its properties."""
+    """Return the pseudo-inverse (p, N) of x (N, p), with ridge and truncated singular values, and its condition."""
     u, s, v = np.linalg.svd(x, full_matrices=False)
     kept = s > max(truncation, 1e-14) * s[0]
     squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
@@ -311,8 +313,8 @@ class Estimator:
             the estimate towards the given parameters.
         truncation: fraction of the largest singular value below which directions keep the given
             parameters.
-        noise_pairs: number of antithetic noise pairs with which the bias caused by position noise is
-            estimated and subtracted; 0 for no correction. Instruments avoid that bias only where
+        noise_pairs: number of pairs of a noise sample and its negative with which the bias caused by
+            position noise is estimated and subtracted; 0 for no correction. Instruments avoid that bias only where
             the regressor is linear in the noise.
     """
 
@@ -394,7 +396,8 @@ def weight_equations(
 
     Args:
         data: equations.
-        structure: base parameters of their motion without noise.
+        structure: base parameters by the null space of the regressor, for a first fit whose residuals
+            determine the weights.
         method: method of the estimator.
         period: period of a repeated motion [s]; required for instruments.
 
@@ -438,7 +441,8 @@ def find_identifiable_parameters(
 
     Args:
         data: weighted equations.
-        structure: base parameters of their motion without noise.
+        structure: base parameters by the null space of the regressor, for a first fit whose residuals
+            give the noise.
         setup: definition of the regressor.
         resting: drives at rest.
         drives: names of the k drives.
@@ -504,7 +508,7 @@ def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray)
 
 
 def _long_run_std(residual: np.ndarray) -> np.ndarray:
-    """Return standard deviations (k,) of independent errors with the low-frequency power of residuals (n, k).
+    """Return the standard deviations (k,) of white noise that is as strong at low frequencies as residuals (n, k).
 
     They are at least those of the residuals.
     """

@@ -164,7 +164,7 @@ def select_determinable_parameters(
 
 
 class MotionLimits(Protocol):
-    """Interface of motion limits of k given joints and of the drives.
+    """Interface of the limits of a motion that is described by the positions of k joints.
 
     Attributes:
         axes: names of the k joints or of their axes.
@@ -211,7 +211,8 @@ def design_motion(
         period: period of the motion [s].
         harmonics: number H of harmonics.
         starts: number of searches, each from random motions.
-        iterations: iterations of each search per penalty weight.
+        iterations: iterations of each search for each of several increasing weights of the penalty for
+            exceeded limits.
         seed: seed of the random motions.
         progress: called with a description of the step and the finished fraction, 0 .. 1.
 
@@ -297,7 +298,11 @@ def _parameter_scales(setup: RegressorSetup, base: Sequence[int] | np.ndarray, m
 
 
 class DriveLimits:
-    """Motion limits of the drives, for given joints that may be any coordinates, such as a pose."""
+    """Limits of stroke, speed and acceleration of the drives, for a motion given in other coordinates.
+
+    These coordinates, the given joints, are for example those of a platform's pose. Their ranges are
+    limited as well.
+    """
 
     def __init__(
         self, setup: RegressorSetup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray,

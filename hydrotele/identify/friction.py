@@ -29,7 +29,7 @@ class FrictionForce(NamedTuple):
     Attributes:
         drive: name of the drive.
         speed: speed [rad/s] or [m/s], positive.
-        force: friction force [N] or [N m] without its asymmetry.
+        force: friction force [N] or [N m], without the part that differs between the directions.
         std: its standard deviation.
         ci95: its 95 % interval.
         unit: unit of the force.

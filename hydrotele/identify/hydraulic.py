@@ -62,7 +62,7 @@ class HydraulicParameter:
 
     @property
     def qualified_name(self) -> str:
-        """Name with location, such as `valve_gain.boom`."""
+        """Name of the effect and its location, such as `valve_gain.boom`."""
         return f"{self.effect}.{self.location}"
 
 
@@ -73,9 +73,9 @@ class HydraulicIdentification:
     Attributes:
         parameters: the identified parameters.
         machine: machine with the parameters that the data determine.
-        nominal_rms_error: RMS of the whitened one-step prediction errors of the held-out run with the given
-            machine [1]. The noise is that stated by the sensors, otherwise that found with the
-            identified machine.
+        nominal_rms_error: RMS of the one-step prediction errors of the held-out run with the given machine,
+            each divided by its predicted standard deviation [1]. The noise is that stated by the sensors,
+            otherwise that found with the identified machine.
         identified_rms_error: the same with the identified machine.
         status: `ok`, or a sentence that names the problem and the remedy.
         seconds: computing time [s].

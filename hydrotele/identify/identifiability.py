@@ -29,7 +29,8 @@ class Identifiability:
 
     Attributes:
         names: names of the m parameters.
-        status: (m,) `unidentifiable`, `combination` or `full`; for noisy data also `weak`.
+        status: (m,) `full` if the data determine the parameter alone, `combination` if only together with
+            others, `unidentifiable` if it has no effect, `weak` if its effect is below the noise.
         base: (r,) indices of the parameters that represent the base parameters.
         combination: (r, m) base parameters as linear combinations of all parameters.
         condition: condition number of the normalised base columns.

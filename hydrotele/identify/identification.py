@@ -81,8 +81,9 @@ def propagate_noise(
 
     Args:
         record: the run.
-        position_resolution: resolution of its positions.
-        gain: (p, n, k) gain of the estimate for the run's equations and all drives; 0 if not used.
+        position_resolution: noise and bandwidth of its positions.
+        gain: (p, n, k) derivative of the p estimates by the force of each equation of the run and each
+            drive; 0 if not used.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
         value: (m,) parameters.
@@ -226,10 +227,10 @@ def _simulate_record(
 def _iterate_segments(
     data: StackedEquations, processing: Processing
 ) -> Iterator[tuple[IdentificationRecord, Resolution, np.ndarray]]:
-    """Yield segments of the runs, the resolution of their positions, and the position noise (k,).
+    """Yield parts of the runs for the simulation of noise, with the resolution and noise (k,) of positions.
 
-    With the periodic method the noise is reduced so that the mean cycle has the noise of the mean
-    of all cycles.
+    The parts limit the computing time for long runs. If a periodic motion is reduced to its mean cycle,
+    fewer cycles are averaged in a part; the noise is then reduced to that of the mean of all cycles.
     """
     lengths = [len(record.force) * record.period for record, _ in data.runs]
     part = min(1.0, _MAX_BIAS_DURATION_S / sum(lengths))
@@ -407,7 +408,7 @@ def fit_base_parameters(
 
 
 def _count_cycles(record: IdentificationRecord, processing: Processing) -> int:
-    """Return the number of cycles that the periodic filter averages; 1 for other methods."""
+    """Return how many cycles of a periodic motion are averaged to a mean cycle; 1 for other filters."""
     if processing.method != "periodic" or not processing.period:
         return 1
     return round(len(record.force) * record.period / processing.period)
@@ -434,10 +435,10 @@ def _has_stated_noise(data: StackedEquations) -> bool:
 
 
 def _compute_covariance(fitted: UncorrectedFit, setup: RegressorSetup) -> np.ndarray:
-    """Return the covariance (r, r) of the base parameters from sensor noise, scaled up for larger residuals.
+    """Return the covariance (r, r) of the base parameters that follows from the sensor noise.
 
-    For long logs, and for the smoother, which adapts to the data, it follows from the residuals
-    only.
+    It is increased by a factor if the residuals indicate a larger covariance. For long logs, and for the
+    optimal smoother, which depends on the data, it follows from the residuals only.
     """
     data, found = fitted.data, fitted.estimate
     readings = sum(record.force.size + record.position.size for record, _ in data.runs)

@@ -216,7 +216,7 @@ def compute_joint_motion(
     Args:
         positions: (n, k) positions [rad] or [m], NaN where missing.
         period: time between rows [s].
-        position_resolution: resolution of the positions.
+        position_resolution: noise and bandwidth of the positions.
         processing: method to differentiate the positions.
 
     Returns:
@@ -238,19 +238,19 @@ def compute_joint_motion(
 def apply_filter_adjoint(
     gain: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
 ) -> np.ndarray:
-    """Convert gains on filtered positions, rates and accelerations to gains on measured positions.
+    """Convert derivatives of results by the filtered motion to derivatives by the measured positions.
 
     This is the adjoint of filtering and differentiation. It holds for all methods except the optimal smoother: the
     filters are symmetric in time, the first derivative is antisymmetric.
 
     Args:
-        gain: (3, p, n, k) gains of p results on positions, rates and accelerations of k joints.
+        gain: (3, p, n, k) derivatives of p results by filtered positions, rates and accelerations of k joints.
         period: time between rows [s].
-        position_resolution: resolution of the positions.
+        position_resolution: noise and bandwidth of the positions.
         processing: method to differentiate the positions.
 
     Returns:
-        (p, n, k) gains on measured positions; 0 for joints at rest.
+        (p, n, k) derivatives by the measured positions; 0 for joints at rest.
     """
     _, p, rows, k = gain.shape
     flat = np.where(position_resolution.is_moving, gain, 0.0).transpose(0, 2, 1, 3).reshape(3, rows, p * k)
@@ -263,7 +263,11 @@ def _apply_linear_filter(
     positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing,
     noise: np.ndarray | None,
 ) -> SmoothedSignal:  # fmt: skip
-    """Filter and differentiate columns by the zero-phase, periodic or raw method, which are linear."""
+    """Filter and differentiate columns by a method that is linear in the readings.
+
+    `zero_phase` filters forwards and backwards, `periodic` keeps the mean and first harmonics of the mean
+    cycle, and `raw` takes differences without a filter.
+    """
     if processing.method == "zero_phase":
         cutoff = min(_CUTOFF_OVER_BANDWIDTH * position_resolution.bandwidth, 0.4 / period)
         return filter_zero_phase(positions, period, cutoff, noise, max_gap=round(MAX_GAP_S / period))
@@ -283,10 +287,10 @@ def _apply_linear_filter(
 
 
 def propagate_rate_std(projection: Projection, given_joints: list[int], rate_std: np.ndarray) -> np.ndarray:
-    """Propagate standard deviations of the given joints' rates to all joints.
+    """Compute the standard deviations of the rates of all joints from those of k independent joints.
 
     Args:
-        projection: projection on k drives.
+        projection: result of `project_on_drives`; it states how the rates of the joints are related.
         given_joints: indices of the k joints whose motion is known.
         rate_std: (n, k) standard deviations of their rates [rad/s] or [m/s].
 

@@ -178,7 +178,7 @@ def keep_beginning(
     Args:
         record: the record.
         max_duration: largest length of the part [s].
-        period: period of the motion, of which a whole number is kept [s]; None for any length.
+        period: period of the motion [s], of which a whole number, at least one, is kept; None for any length.
 
     Returns:
         The cut record.

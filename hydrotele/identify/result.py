@@ -154,7 +154,7 @@ class ParameterRow:
             do not determine it.
         std: standard deviation, or None.
         ci95: 95 % interval, or None.
-        status: see `STATUS_DESCRIPTIONS`.
+        status: whether the parameter is identifiable, one of the keys of `STATUS_DESCRIPTIONS`.
         combination: the combination that the name represents, or those that contain the parameter;
             empty if there is none.
         bias: bias caused by position noise, already subtracted from the value; or None.

@@ -28,9 +28,10 @@ from hydrotele.multibody.inverse_dynamics import (
 def drive_friction_terms(machine: Machine, chain: Chain) -> list[FrictionTerm]:
     """Build the friction terms of all drives, with the machine's friction parameters as given values.
 
-    Coulomb and viscous friction are always included. Stribeck friction and the asymmetries
-    `coulomb_asymmetry` (F_c a_c), `stribeck_asymmetry` (F_s a_c) and `viscous_asymmetry` (b a_v)
-    are included if they are not 0.
+    Coulomb and viscous friction are always included. Stribeck friction and the differences between the
+    two directions are included if they are not 0. Each asymmetry is a force or coefficient: the friction
+    times the relative asymmetry in the machine file. The smoothing velocity and the Stribeck velocity,
+    on which the force does not depend linearly, are constants of the term.
 
     Args:
         machine: the machine.
@@ -38,8 +39,6 @@ def drive_friction_terms(machine: Machine, chain: Chain) -> list[FrictionTerm]:
 
     Returns:
         One friction term per drive.
-
-    Source: nominal model, "Piston force"; its nonlinear velocities are not parameters.
     """
     return [
         FrictionTerm(joint, _friction_parameters(f), f.smoothing_velocity, f.stribeck_velocity)

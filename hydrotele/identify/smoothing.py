@@ -159,10 +159,10 @@ def transition_matrices(order):
 
 @compiled
 def _marginalise_input(info, drive, ratio, order, column):
-    """Marginalise the random input out of a state's information matrix R, in place.
+    """Reduce a state's information matrix R, in place, by the uncertainty of the random input of one step.
 
-    R becomes R - R b (1/r + b'R b)^-1 b'R, with `drive` b and `ratio` r. Writes the gain (1/r + b'R b)^-1 R b into
-    `column` and returns 1/r + b'R b.
+    R becomes R - R b (1/r + b'R b)^-1 b'R, where b (`drive`) is the effect of the input on the state and r
+    (`ratio`) its variance. The gain (1/r + b'R b)^-1 R b is written to `column`; 1/r + b'R b is returned.
     """
     total = 1.0 / ratio
     for i in range(order):
@@ -214,8 +214,8 @@ def compute_backward_information(known, ratio, order, infos, gains, totals):
         ratio: r, variance of the input over that of the noise, scalar [1], > 0.
         order: number m of integrators [1].
         infos: (n, m, m) written: R_j, information of samples j .. n-1 about state j.
-        gains: (n, m) written: R_(j+1) b / totals_j; the optimal input has the term
-            `-gains_j . T c_j`.
+        gains: (n, m) written: R_(j+1) b / totals_j, where b is the effect of the input on the state. The
+            optimal input of step j has the term `-gains_j . T c_j` with transition matrix T and state c_j.
         totals: (n,) written: 1/r + b' R_(j+1) b.
 
     Returns:
@@ -359,7 +359,8 @@ class OptimallySmoothed(SmoothedSignal):
 
     Attributes:
         noise: (k,) standard deviation of one sample, given or estimated [u].
-        input_std: (k,) root mean square of the input, given or estimated [u/s^order].
+        input_std: (k,) root mean square of the signal's derivative of order `order`, given or estimated
+            [u/s^order].
         order: number of integrators [1].
         period: time between samples [s].
         known: (n, k) whether a sample exists.
@@ -488,7 +489,9 @@ def sample_smoothing_errors(smoothed: OptimallySmoothed, count: int, seed: int =
 def _normalise_samples(
     samples: np.ndarray, known: np.ndarray, noises: np.ndarray | None, k: int
 ) -> tuple[np.ndarray, float, float]:
-    """Make samples dimensionless: subtract the mean, divide by the noise or, if unknown, the step scatter.
+    """Make samples dimensionless: subtract their mean and divide by their noise.
+
+    If the noise is unknown, the divisor is the standard deviation of the steps between known samples.
 
     Returns:
         The scaled samples, the mean, and the divisor.

@@ -125,13 +125,14 @@ def find_implausible_parameters(identifiability: Identifiability, table: Regress
     """Find masses, moments of inertia and friction that are negative with 95 % confidence.
 
     Args:
-        identifiability: base parameters.
+        identifiability: base parameters, as combinations of all parameters.
         table: names, units and nominal values of the parameters.
         found: estimate of the base parameters.
 
     Returns:
-        One sentence per implausible parameter. A combination is implausible if all its members with an
-        effect on its sign are such parameters with positive factors.
+        One sentence per implausible parameter. A combination of parameters is reported if it can only be
+        positive, as a sum with positive factors. One that represents friction is also reported if its
+        value with the nominal parameters is not negative.
     """
     notes = []
     for k, b in enumerate(identifiability.base):

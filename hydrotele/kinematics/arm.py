@@ -62,7 +62,8 @@ def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float
     """Compute the arm's pose from its joint angles, in cylindrical coordinates about the swing axis.
 
     x = a1 + a2 cos(q2) + a3 cos(q2 + q3) + tool, z likewise with sines; r = sqrt(x^2 + d2^2),
-    theta = q1 + atan2(d2, x), phi = q2 + q3 + q4.
+    theta = q1 + atan2(d2, x), phi = q2 + q3 + q4. `ArmGeometry` gives the lengths a1, a2, a3 and the
+    lateral offset d2.
 
     Args:
         geometry: the arm.
@@ -84,9 +85,9 @@ def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float
 
 
 def forward_kinematics_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
-    """Compute the Cartesian position of the arm's controlled point from its joint angles (Zhu Eq. 2.2).
+    """Compute the Cartesian position of the arm's controlled point from its joint angles (Zhu 1994, Eq. 2.2).
 
-    (x, y) = Rot(q1) (x of the arm plane, d2).
+    (x, y) = Rot(q1) (x of the arm plane, d2), with the lateral offset d2 of this plane.
 
     Args:
         geometry: the arm.
@@ -107,10 +108,11 @@ def forward_kinematics_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> t
 
 
 def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tuple[float, ...]:
-    """Compute the joint angles of an excavator arm for a pose (Zhu Eqs 2.3-2.6).
+    """Compute the joint angles of an excavator arm for a pose (Zhu 1994, Eqs 2.3-2.6).
 
-    x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x). The tool offset, rotated by phi, is subtracted.
-    With l the distance from boom pin to tool pin, A = (a2 + a3)^2 - l^2, B = l^2 - (a2 - a3)^2:
+    x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x), with the lateral offset d2 of the arm's plane. The
+    tool offset, rotated by phi, is subtracted. l is the distance from boom pin to tool pin, a2 the boom
+    length and a3 the stick length. With A = (a2 + a3)^2 - l^2, B = l^2 - (a2 - a3)^2:
     q3 = -atan2(2 sqrt(A B), B - A), q2 = direction of the tool pin minus direction of
     (a2 + a3 cos(q3), a3 sin(q3)), q4 = phi - q2 - q3. Without a tool joint the stick and the fixed
     tool are one straight bar from the stick pin to the controlled point.
@@ -162,7 +164,8 @@ def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int 
 def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
     """Compute the derivatives of the arm's cylindrical pose (r, theta, z, phi) by its joint angles.
 
-    dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx; dz and dphi are the derivatives of z and phi.
+    dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx; dz and dphi are the derivatives of z and phi. x is the
+    distance ahead of the swing axis in the arm's plane, and d2 the lateral offset of this plane.
 
     Args:
         geometry: the arm.

@@ -122,9 +122,9 @@ def tool_direction(q: Sequence[float]) -> np.ndarray:
 def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolution:
     """Compute the joint angles for a tool position, attitude and head angle, with the stick hanging down.
 
-    The tool is offset from the arm's plane by head radius times sine of the head angle, so that the
-    plane's azimuth solves `A cos + B sin = C`. The solution in which the arm reaches backwards over
-    its own axis is discarded. An unreachable pose is replaced by the nearest reachable pose, which
+    The tool is offset from the arm's plane by head radius times sine of the head angle; the swing
+    angle takes this into account. The solution in which the arm reaches backwards over its own swing
+    axis is discarded. An unreachable pose is replaced by the nearest reachable pose, which
     depends continuously on the requested one.
 
     Args:

@@ -64,7 +64,7 @@ class UnreachableError(ValueError):
 
 
 class DhRow(StrictModel):
-    """A carriage joint given by its D-H row (Wang, Table 1): lengths [m], angles [rad]."""
+    """A carriage joint given by its D-H row (Wang 2012, Table 1): lengths [m], angles [rad]."""
 
     joint: str
     kind: Literal["prismatic", "revolute"]
@@ -238,7 +238,7 @@ def build_hybrid(facts: HybridSpec) -> HybridRobot:
 
 
 def dh_transform(theta, d, a, alpha) -> np.ndarray:
-    """Return D-H transforms Rz(theta) Tz(d) Tx(a) Rx(alpha) (Wang Eq. 6).
+    """Return D-H transforms Rz(theta) Tz(d) Tx(a) Rx(alpha) (Wang 2012, Eq. 6).
 
     Args:
         theta: (...) joint angle [rad].
@@ -372,7 +372,7 @@ def carriage_pose(robot: HybridRobot, joints: np.ndarray) -> np.ndarray:
 def leg_vectors(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
     """Compute the vectors along the six legs, from universal joint A_i to spherical joint B_i.
 
-    They are in the connecting platform's frame (Wang Eqs 8 and 10).
+    They are in the connecting platform's frame (Wang 2012, Eqs 8 and 10).
 
     Args:
         robot: the robot.
@@ -389,7 +389,7 @@ def leg_vectors(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> n
 
 
 def leg_readings(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
-    """Compute the readings of the leg sensors at a pose (Wang Eq. 11).
+    """Compute the readings of the leg sensors at a pose (Wang 2012, Eq. 11).
 
     Args:
         robot: the robot.
@@ -445,7 +445,7 @@ def home_pose(robot: HybridRobot, joints: np.ndarray) -> PlatformPose:
 def leg_jacobian(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
     """Compute the derivatives of leg readings by the platform's position [m] and rotation vector [rad].
 
-    The rotation is that of exp(w) R in frame 0.
+    The rotation vector w changes the platform's rotation R to exp(w) R, in frame 0.
 
     Args:
         robot: the robot.
@@ -453,7 +453,8 @@ def leg_jacobian(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> 
         pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6, 6): row k is (u_k, (R b_k) x u_k), u_k the direction of leg k in frame 0.
+        (..., 6, 6): row k is (u_k, (R b_k) x u_k), with the direction u_k of leg k in frame 0. R is the
+        platform's rotation, b_k the position of joint B_k in the platform's frame.
     """
     carriage = carriage_pose(robot, joints)
     legs = leg_vectors(robot, joints, pose)
@@ -468,7 +469,8 @@ def forward_kinematics(
 ) -> PlatformPose:
     """Compute the platform's pose from leg readings and carriage joints by Newton's method.
 
-    Up to 40 poses have the same lengths; the result is the one on the start's branch.
+    Up to 40 poses have the same lengths; the result is the one that the iteration reaches from the
+    start pose.
 
     Args:
         robot: the robot.
@@ -554,7 +556,7 @@ def forward_kinematics_by_evolution(
 
 
 def euler_to_rotation(angles: np.ndarray) -> np.ndarray:
-    """Return the rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang Eq. 9).
+    """Return the rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang 2012, Eq. 9).
 
     Args:
         angles: (..., 3) about x, y, z: alpha, beta, gamma [rad].
@@ -749,12 +751,11 @@ def build_error_model(robot: HybridRobot, kind: ErrorModelKind) -> ErrorModel:
 
 
 def refined_model_parameters(model: ErrorModel) -> tuple[str, ...]:
-    """Return the 36 parameters of Wang's refined model: carriage, B_i and leg offsets, no A_i.
+    """Return the names of the 36 parameters of the refined error model of Wang 2012.
 
-    The chapter that lists them is not in the available text; this choice is inferred. Without the
-    18 coordinates of A_i, 36 of 54 parameters remain. The captions of Figs 12 to 17 correlate
-    carriage parameters with coordinates of A_i only. That of Fig. 18 (36 parameters) names a4,
-    theta4, b1x, b6z.
+    They are all parameters except the 18 coordinates of the universal joints A_i: those of the
+    carriage, of the spherical joints B_i and the leg offsets. The available text of Wang 2012 gives
+    only their number and some of their names; this choice is inferred from figure captions.
     """
     legs = model.names[model.carriage_parameter_count :]
     return model.names[: model.carriage_parameter_count] + tuple(n for n in legs if n[0] != "a")
@@ -768,7 +769,7 @@ def add_errors_to_geometry(model: ErrorModel, errors: np.ndarray) -> GeometryBat
         errors: (W, p) errors [model.units].
 
     Returns:
-        The arguments of `batch_readings`.
+        W geometries: transforms of the carriage, positions of A_i and B_i, and leg offsets.
     """
     errors = np.atleast_2d(errors)
     robot, count = model.nominal, model.carriage_parameter_count
@@ -786,7 +787,7 @@ def predict_leg_readings(
     model: ErrorModel, errors: np.ndarray, joints: np.ndarray, rotation: np.ndarray,
     position: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Predict the leg readings at measured poses for sets of geometric errors (Wang Eq. 29).
+    """Predict the leg readings at measured poses for sets of geometric errors (Wang 2012, Eq. 29).
 
     Args:
         model: the error model.
@@ -841,10 +842,10 @@ def apply_geometry_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
 
 
 def first_order_carriage_pose(robot: HybridRobot, errors: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Compute the carriage pose with errors by the publication's linear model (Wang Eqs 12 to 26).
+    """Compute the carriage pose with errors by the publication's linear model (Wang 2012, Eqs 12 to 26).
 
-    dT = sum_i (0T_{i-1}) (d Ai) (iT4), with d Ai = A_i delta_i and delta_i = D_theta dtheta + D_d
-    dd + D_a da + D_alpha dalpha (Eq. 18).
+    The change of the pose is the sum over all joints. Each summand is the product of all joint
+    transforms, in which that of one joint is replaced by its first-order change due to its errors.
 
     Args:
         robot: robot given by D-H rows.

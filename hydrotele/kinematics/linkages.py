@@ -216,7 +216,7 @@ class TwoBar:
         return m.sqrt(constant + self.lower * self.upper * chord**2)
 
     def rate(self, theta: Scalar) -> Scalar:
-        """Return the moment arm dc/dtheta = direction a b sin(B) / c of the cylinder (Zhu Eq. 6.13).
+        """Return the moment arm dc/dtheta = direction a b sin(B) / c of the cylinder (Zhu 1994, Eq. 6.13).
 
         a and b are `lower` and `upper`, B the included angle, c the pin-to-pin length.
 
@@ -237,7 +237,8 @@ class TwoBar:
         """Return the joint angle theta = direction (B - angle_offset) at a pin-to-pin length.
 
         The included angle B is in [0, pi]: tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) with the
-        length p = sqrt(c^2 - h^2) in the plane perpendicular to the axis.
+        length p = sqrt(c^2 - h^2) in the plane perpendicular to the axis. a and b are `lower` and `upper`, h
+        is `axial_offset`.
 
         Args:
             length: pin-to-pin length c, any shape [m], with p in [|a - b|, a + b].
@@ -263,8 +264,9 @@ def two_bar_from_points(
 ) -> TwoBar:
     """Build a two-bar linkage (cylinder across a joint) from the positions of its two pins.
 
-    B = |polar(rod) + theta - polar(base)|; the direction is the sign of the difference at the
-    working angle.
+    The included angle is B = |polar(rod) + theta - polar(base)| with the polar angles of the pins and
+    the joint angle theta. The sign of the difference at the working angle gives the direction: whether
+    the cylinder extends or retracts as theta increases.
 
     Args:
         base_pin: (x, z) of one cylinder pin in the inboard link's axes, from the joint [m].

@@ -138,8 +138,8 @@ def chain_poses_and_derivatives(
     """Compute poses of the chain's end, and their derivatives by constants and joint coordinates.
 
     An element rotates or translates everything beyond it about or along its axis u through its
-    origin o: a rotation moves the end by u x (p - o) and rotates it by u, a translation moves it
-    by u.
+    origin o. Per radian, a rotation moves the end at position p by u x (p - o) and rotates it by u; per
+    metre, a translation moves it by u.
 
     Args:
         chain: chain with k joints and p parameters.

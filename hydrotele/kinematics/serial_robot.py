@@ -173,7 +173,8 @@ def expand_mimic_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
 def robot_chain(robot: SerialRobot) -> SerialChain:
     """Build a robot's kinematic chain for calibration.
 
-    Its parameters are six small errors in front of every joint and the ball position.
+    Its parameters are six small errors in front of every joint, and the position of the ball at the
+    robot's end, which a calibration measures.
 
     Args:
         robot: robot with joints along any axes.
@@ -305,7 +306,9 @@ def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequen
 
 
 def compute_ball_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
-    """Compute the poses of the ball from encoder readings, with the robot's joint corrections.
+    """Compute the poses of the ball at the robot's end from encoder readings, with joint corrections.
+
+    The corrections are the joint deflection under gravity and the encoder eccentricity of the robot.
 
     Args:
         robot: nominal or calibrated robot.
@@ -328,10 +331,10 @@ def solve_joints_for_ball(
     robot: SerialRobot, ball_positions: np.ndarray, start: np.ndarray, iterations: int = 50,
     idle: int | None = None,
 ) -> PositionSolution:  # fmt: skip
-    """Compute encoder readings that bring the ball to given positions, by damped least squares.
+    """Compute encoder readings that bring the ball at the robot's end to given positions.
 
-    Every step is a damped minimum-norm step with the robot's Jacobian; the damping vanishes with
-    the remaining distance.
+    The method is damped least squares: every step is a damped minimum-norm step with the robot's
+    Jacobian, and the damping vanishes with the remaining distance.
 
     Args:
         robot: nominal or calibrated robot.

@@ -89,7 +89,10 @@ def compute_tip_pose(arm, q, pose):
 
 @compiled
 def solve_joint_angles(g, pose, present_swing, q):
-    """Compute the joint angles for a pose of the tip, with the elbow above and the tip ahead.
+    """Compute the joint angles for a pose of the arm's tip (inverse kinematics).
+
+    Of several solutions it is the one with the tip ahead of the swing axis and the pin between boom and
+    stick above the line between the ends of both.
 
     Args:
         g: (9,) output of `arm_parameters`.

@@ -378,7 +378,7 @@ def load_log(
     """Read and check one run from a `.parquet` or `.csv` file or from a run folder.
 
     Empty cells become NaN, rows may be missing (`Log.gaps` lists them), and time stamps are repaired,
-    see `stamps.repair_time`; the notes of the log state the repairs.
+    see `stamps.repair_time_stamps`; the notes of the log state the repairs.
 
     Args:
         path: the file, or the folder of a run, whose measured log is read.

@@ -46,7 +46,7 @@ class Friction(StrictModel):
 
     @property
     def has_presliding(self) -> bool:
-        """Whether presliding applies: a presliding stiffness and a dry friction force."""
+        """Whether friction has presliding: its presliding stiffness and dry friction are above 0."""
         return self.presliding_stiffness > 0.0 and self.coulomb + self.stribeck_extra > 0.0
 
 
@@ -285,7 +285,9 @@ class Pump(StrictModel):
     def stall_pressure(self) -> float:
         """Pressure difference that stalls the motor at full duty [Pa]; 20 MPa without a motor.
 
-        `(k U / R - drag) / (D (1 + loss))`; common gear pumps are rated for 20 MPa.
+        It is `(k U / R - drag) / (D (1 + loss))` with the motor's torque constant k, voltage U,
+        resistance R and drag torque. D is the pump's displacement, loss its fraction of lost torque.
+        Common gear pumps are rated for 20 MPa.
         """
         motor = self.motor
         if motor is None:

@@ -115,7 +115,10 @@ class HandImpedance(StrictModel):
 
     @property
     def carried_mass(self) -> float:
-        """Mass of the hand whose weight the handle carries [kg]: the smallest over all directions."""
+        """Mass of the hand whose weight the handle carries [kg].
+
+        It is the smallest of the hand's effective masses in all directions, which differ by `mass_shape`.
+        """
         return self.mass * min(1.0, find_principal_values(self.mass_shape).min_value)
 
     def axis_impedance(self, axis: int) -> tuple[float, float, float]:

@@ -356,6 +356,8 @@ class Machine(StrictModel):
     def end_stop(self, axis: str) -> EndStop | None:
         """Return the end stop of an axis, or None if its travel is unlimited.
 
+        A force drive without gain has only the end stop of the machine file, if any.
+
         If the machine file has none, it is estimated. Its stiffness is the largest drive force divided by
         1 mm or 2 mrad: the typical deformation of tube, gland and pins of a heavy cylinder at that force.
         """

@@ -191,8 +191,8 @@ def close_loops(mech, m, z):
 
     Args:
         mech: ReducedMechanism.
-        m: ReducedMotion; frames of the links, dependent positions and rates, `basis`, `loop` and
-            `normal` are written.
+        m: ReducedMotion; written are the frames of the links, the positions, the dependent rates per
+            independent rate (`basis`), and the closure equations with their factor (`loop`, `normal`).
         z: (>= n,) independent positions [rad] or [m].
 
     Returns:
@@ -244,7 +244,7 @@ def close_loops(mech, m, z):
 
 @compile_without_allocation
 def compute_drift(mech, m):
-    """Compute the accelerations of the dependent coordinates at zero independent accelerations.
+    """Compute the accelerations (DRIFT) of the dependent coordinates at zero independent accelerations.
 
     Args:
         mech: ReducedMechanism.
@@ -463,7 +463,7 @@ def _shape_row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0,
 def _append_coordinate_end(tree: np.ndarray) -> np.ndarray:
     """Append the column COORDINATE_END to `tree` (f, 3): one plus the last coordinate that moves a frame.
 
-    Tube and rod of a bar have the larger value of both.
+    Tube and rod of a bar both get the larger of their two values.
     """
     reach = np.zeros(len(tree), int)
     for i, (parent, _, coordinate) in enumerate(tree[1:], start=1):

@@ -77,7 +77,7 @@ TICK_LOOP_RECORD = np.dtype(
 
 
 class TickLoop(NamedTuple):
-    """Arguments of the compiled loop over control ticks, in addition to machine, plan and station.
+    """Settings and memory of the compiled loop over control ticks, passed to it as one record.
 
     Attributes:
         record: (1,) record of type `TICK_LOOP_RECORD`.
@@ -124,8 +124,8 @@ def run_planned_ticks(ticks, simulated, planned, row, contacts, first, last, sto
         planned: record of plan and controller, from `control.tick.planned_run_record`.
         row: record of the log rows, from a `Recorder`.
         contacts: record of contact forces, from `simulate.record.contact_record`.
-        first: first control tick, scalar.
-        last: control tick before which to stop, scalar.
+        first: number of the first control tick, scalar.
+        last: number of the control tick before which to stop, scalar.
         stopped: whether all commands are set to 0, scalar.
 
     Returns:

@@ -536,9 +536,9 @@ def _dead_worker_outcome(worker: _Worker) -> Outcome:
 
 @contextlib.contextmanager
 def _child_process_environment() -> Iterator[None]:
-    """Context in which started processes get one thread each and ignore Ctrl-C.
+    """Give processes that are started in the context one thread each, and let them ignore Ctrl-C.
 
-    This process handles Ctrl-C for them.
+    The calling process handles Ctrl-C for them.
     """
     old = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

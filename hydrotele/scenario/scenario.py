@@ -484,7 +484,9 @@ def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
 
 
 def _load_pilot_table(scenario: Scenario, where: str) -> Scenario:
-    """Replace the log file of a table pilot by its columns, so that the scenario is self-contained.
+    """Replace the log file of a pilot that follows a table by its columns.
+
+    The scenario is then self-contained.
 
     `where` names file, line and key in error messages. Raise InputError for an unsuitable log.
     """
@@ -554,7 +556,7 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
 def read_soil_from_log(log: Log) -> tuple[SoilGround, ...]:
     """Read from a log's metadata the soil that the bucket could dig during the run.
 
-    The result has one element, or is empty if the run had no soil.
+    The result contains one soil, or is empty if the run had none.
 
     Raises:
         InputError: the metadata are damaged.

@@ -164,7 +164,10 @@ def _effect_rows(gap: Gap) -> list[dict[str, Any]]:
 
 
 def _calibration_rows(gap: Gap) -> list[dict[str, Any]]:
-    """Return table rows of the calibrated parameters with their 95 % intervals, largest changes first."""
+    """Return table rows of the parameters that the search calibrated before it tested effects.
+
+    The largest changes are the first rows.
+    """
     rows = []
     for key in most_moved(gap) if gap.calibration else ():
         s = in_customary_units(gap.calibration[key], key)
@@ -221,7 +224,7 @@ def _validation_content(gap: Gap) -> dict[str, Any]:
 
 
 def _channel_error_rows(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
-    """Return table rows of the RMS prediction error of each channel, in multiples of sensor noise.
+    """Return table rows of the RMS prediction error of each channel over its predicted standard deviation.
 
     `before` is the prediction of the given model, `after` that of the corrected one, if there is one.
     """

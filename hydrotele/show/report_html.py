@@ -154,7 +154,7 @@ def write_sections(
         heading: summary of the result in a few words.
         lead: one or two sentences below the heading.
         sections: sections of the report.
-        figures: key figures as (class, number, label), shown large.
+        figures: key figures as (CSS class, number, label), shown in large type.
     """
     write_template_report(
         "sections", path, title=overline, over=overline, heading=heading, lead=lead, sections=sections,
@@ -163,7 +163,11 @@ def write_sections(
 
 
 class Interval(NamedTuple):
-    """Positions in a drawing [px]: value, start and length of its interval, and model value."""
+    """Positions of an estimate and its confidence interval in a drawing of `width` [px].
+
+    `start` and `length` are those of the interval, `model` is the position of the value in the given model.
+    None means not finite.
+    """
 
     width: int
     value: float | None
@@ -173,7 +177,7 @@ class Interval(NamedTuple):
 
 
 def scale_interval_to_pixels(value: float, low: float, high: float, model: float) -> Interval | None:
-    """Scale an estimate, its interval and the model value to positions in a small drawing [px].
+    """Scale an estimate, its interval and the value in the given model to positions in a small drawing [px].
 
     Values that are not finite have the position None; the result is None if no value is finite.
 
@@ -194,7 +198,10 @@ def scale_interval_to_pixels(value: float, low: float, high: float, model: float
 
 
 class Dumbbell(NamedTuple):
-    """Positions in a drawing [px]: of the value 1, of the value before and of the value after."""
+    """Positions of two error ratios in a drawing of `width` [px]: before and after a correction of the model.
+
+    `one` is the position of the ratio 1, that of a perfect model.
+    """
 
     width: int
     one: float

@@ -175,8 +175,9 @@ def draw_stability_maps(found: TeleopFindings) -> bytes:
 def draw_stiffness_stability(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
     """Draw the stability of a joystick with force-dependent stiffness over damping and maximum stiffness.
 
-    The left panel is the margin B^2 - 4 M K_max, the right one the stability by this margin or under
-    the worst-case switching of the stiffness.
+    With damping B, mass M and maximum stiffness K_max, the joystick is stable for B^2 - 4 M K_max > 0. The
+    left panel shows this margin. The right one shows where the joystick is stable by it, where only the
+    computed motion under the worst switching of the stiffness decays, and where neither holds.
 
     Args:
         spring: joystick without a hand.

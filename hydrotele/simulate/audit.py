@@ -136,9 +136,10 @@ def _compute_port_flows_and_air(pressure, relief, gain, tank, makeup, air, relea
 
 
 def _flows_after_switching(plant, i, act, x, v):
-    """Return the result of `compute_state_flows_and_forces` at the start of every step; axis i is switched.
+    """Return flows and forces (`compute_state_flows_and_forces`) at the start of every step, for pump axis i.
 
-    The axis has its own pump. Its valve switches at the start of a step, while the pump keeps its speed.
+    The valve of this axis, which has its own pump, is already on the side that it has during the step. It
+    switches at the start of a step, while the pump keeps its speed.
     """
     switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
     switched[:-1, a] = [

@@ -35,7 +35,7 @@ _MOTION_TOLERANCE = 1.0e-9  # the same for poses that are only displayed [m]
 
 
 def dependent_joints(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the joints whose positions follow from the loops: tubes, rods and undriven links."""
+    """Return the names of the joints whose positions follow from the loops: those of tubes, rods and undriven links."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
     tilts = [tilt_joint_name(name) for name in cylinders if has_ball_ends(machine, name)]

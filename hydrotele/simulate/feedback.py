@@ -60,7 +60,7 @@ def quantise_reading(value, step, low, high):
     Returns:
         The reading, scalar [channel's unit].
 
-    Source: nominal model, "Sensors".
+    Source: models/cat215/README.md, "Sensors".
 
     >>> quantise_reading(0.30, 0.25, 0.0, 1.0), quantise_reading(1.2, 0.25, 0.0, 1.0)
     (0.25, 1.0)
@@ -141,8 +141,8 @@ def simulate_readings(
     Returns:
         Channel -> (n,) readings.
 
-    Source: nominal model, "Sensors": noise first, then the converter; the machine's `sample_sensor_errors`
-        act before both, also on ideal sensors.
+    Source: models/cat215/README.md, "Sensors": noise first, then the converter. The errors of
+        `apply_sensor_errors` act before both, also on ideal sensors.
     """
     readings = {}
     time = period * np.arange(max((len(values) for values in truth.values()), default=0))
@@ -214,7 +214,7 @@ def convert_to_readings(sensors, values, errors):
     Returns:
         Nothing.
 
-    Source: nominal model, "Sensors".
+    Source: models/cat215/README.md, "Sensors".
     """
     for c in range(len(errors)):
         value = sensors.scale[c] * values[c] + sensors.offset[c] + errors[c]
@@ -275,7 +275,7 @@ def sample_sensors_if_due(table, sim, tick, steps):
     Returns:
         Nothing.
 
-    Source: nominal model, "Sensors".
+    Source: models/cat215/README.md, "Sensors".
     """
     if tick % table.ticks_per_sample != 0:
         return

@@ -65,11 +65,11 @@ class MeasuredPoses(NamedTuple):
 
 
 def default_wires() -> WireGeometry:
-    """Return six wires from a hexagon around the IWR's rails to three arms of the platform.
+    """Return six wires for measuring poses of the robot IWR, from a hexagon around its rails to three arms.
 
-    The hexagon has a radius of 1.5 m and lies 1 m below frame 0, centred at half the length of the
-    rails. The arms have a length of 0.45 m. The order of the wires gives the smallest measurement
-    errors over the workspace among all orders.
+    The hexagon has a radius of 1.5 m and lies 1 m below frame 0 (base), centred at half the length of
+    the rails. The arms are fixed to the platform and have a length of 0.45 m. Of all assignments of arms to
+    corners, this one gives the smallest measurement errors over the workspace.
     """
     at = np.arange(LEG_COUNT) * np.pi / 3.0
     corners = np.column_stack([np.full(LEG_COUNT, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
@@ -86,8 +86,8 @@ def sample_manufacturing_errors(
 ) -> np.ndarray:  # fmt: skip
     """Sample the manufacturing errors (p,) of a robot from normal distributions of mean zero.
 
-    Their standard deviations are `size` times `model.scales`, in the units of `model`. With `names`,
-    only the errors of these names are sampled; all others are zero.
+    The standard deviation of each of the p errors of `model` is `size` times its value in `model.scales`.
+    With `names`, only the errors of these names are sampled; all others are zero.
     """
     errors = rng.normal(size=len(model.names)) * model.scales * size
     if names is not None:
@@ -104,7 +104,7 @@ def sample_poses(
     """Sample random reachable poses: carriage over its whole range, platform about its home pose.
 
     Args:
-        robot: nominal robot.
+        robot: the robot, without manufacturing errors.
         count: number of poses N.
         rng: random generator.
         wires: if given, poses that these wires measure with large errors are rejected.

@@ -1,4 +1,6 @@
-"""Simulation of a maglev joystick in MuJoCo: flotor, coils, stops, operator's arm, cab motion.
+"""Simulation of a maglev joystick in MuJoCo: levitated part, coils, stops, operator's arm, cab motion.
+
+The flotor is the levitated part with the handle and the coils; the stator is fixed to the cab.
 
 The cab's frame is not inertial: its acceleration is added to gravity, and its rotation acts on the
 flotor as force and torque. The coil currents heat the coils. The coil force decreases towards the

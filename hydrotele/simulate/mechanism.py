@@ -442,8 +442,8 @@ def tilt_joint_name(axis: str) -> str:
 def _write_travel(root, machine: Machine, name: str) -> None:
     """Set the travel limits of a cylinder axis at the rod slide.
 
-    If the range of the axis' joint is defined there, the joint gets no limit, because two end stops
-    would share the load.
+    If the range of the joint that the cylinder moves is also enforced by these limits, the joint itself gets
+    no limit, because two end stops would share the load.
     """
     root.find("joint", f"{name}_rod").range = drive_travel(machine, name)
     if joint_range_at_drive(machine, name):

@@ -9,8 +9,9 @@ from the last activation. The force uses the pressures at the end of the step, a
 otherwise explicit stepping would add negative damping.
 
 The callbacks use only their arguments mjModel and mjData. They are thread-safe, and a model can be
-randomised through `actuator_user`. Actuators without the marker are ignored. The terms of a machine
-are custom numerics of its model, which may differ between the models of a batch.
+randomised through `actuator_user`. Actuators whose first parameter is not ACTUATOR_MARKER are
+ignored. The terms (additional laws) of a machine are custom numerics of its model, which may differ
+between the models of a batch.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -190,7 +191,8 @@ def _write_force_drive_rates(user, u, act, rate, velocity, command, low, high, d
 def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
     """Step the hydraulic circuit, and write the rates of bristles and of terms with an internal state.
 
-    The arguments are those of `step_circuit`. `arrived` (nu,) are the commands before command terms.
+    The arguments are those of `step_circuit`. `arrived` (nu,) are the
+    commands before those terms were added that change commands.
     """
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count

@@ -288,7 +288,7 @@ def build_plant(
 def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
     """Return for each additional state (`extra_state_names`) its index in `act`.
 
-    The bristle state of a force drive is an activation of its own actuator; the others follow after
+    The bristle state of a force drive is an activation of the actuator of that drive; the others follow after
     those of the hydraulic axes.
     """
     places, first = {}, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes)

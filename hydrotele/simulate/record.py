@@ -138,7 +138,7 @@ _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 def _count_single_dof_joints(kinds):
     """Return the number of joints of one degree of freedom that precede the first ball or free joint.
 
-    `kinds` (njnt,) are MuJoCo's joint types; 0 is returned if no such joint exists.
+    `kinds` (njnt,) are MuJoCo's joint types; the result is 0 if there is no ball or free joint.
     """
     for k in range(len(kinds)):
         if kinds[k] == _BALL or kinds[k] == _FREE:
@@ -419,7 +419,7 @@ def sum_contact_forces(record, total):
 def _sum_contact_forces_by_group(r, totals):
     """Write the sums of the contact forces on the machine per group, in the world frame.
 
-    `totals` (3 n,) [N]: forces of group k are in the k-th triple; groups above n use the last one.
+    `totals` (3 n,) [N]: the force of group k is the k-th triple, those of groups above n are added to the last.
     """
     totals[:] = 0.0
     around, wrench, groups = int64_view(r.around, r.geoms), np.empty(6), len(totals) // 3
@@ -455,7 +455,7 @@ def state_supply_pressure(user, count, act, scratch):
     Returns:
         p_s, scalar [Pa].
 
-    Source: nominal model, "Supply".
+    Source: models/cat215/README.md, "Supply".
     """
     compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
     return circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
@@ -476,7 +476,7 @@ def compute_state_flows_and_forces(user, count, act, x, v):
         (n, 1 + 3 count): supply pressure [Pa]; then for every axis the valve flows into head and rod
         chamber [m^3/s] and the force after friction [N] or [N m], without terms.
 
-    Source: nominal model.
+    Source: models/cat215/README.md.
     """
     scratch = np.zeros(SCRATCH_SIZE)
     out = np.zeros((act.shape[0], 1 + 3 * count))

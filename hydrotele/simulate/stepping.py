@@ -164,7 +164,7 @@ def true_sensor_values(sim, out):
     Returns:
         Nothing.
 
-    Source: `simulate.record.aligned_positions` and `state_supply_pressure`.
+    Source: `simulate.record.align_staggered_positions` and `state_supply_pressure`.
     """
     k, h = sim.axes, sim.hydraulic
     for i in range(k):
@@ -293,7 +293,7 @@ def apply_sensor_delays(past, number, values):
     Returns:
         Nothing.
 
-    Source: nominal model, "Sensors".
+    Source: models/cat215/README.md, "Sensors".
     """
     length = len(past.ring)
     if length == 0:

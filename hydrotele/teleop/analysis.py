@@ -93,8 +93,8 @@ class TeleoperatorAxis:
 
         Args:
             structure: name, one of `STRUCTURES`, such as `position_force`.
-            return_gain: factor on both return channels, force C2 and velocity C4, which is the gain of
-                the loop through hand and task [1].
+            return_gain: factor on the force and the velocity that are returned from the slave to the
+                master [1]; it scales the gain of the loop through hand and task.
 
         Returns:
             The two-port.
@@ -207,7 +207,7 @@ class StiffnessFeedbackAxis(StrictModel):
         return self
 
     def to_stiffness_axis(self) -> StiffnessAxis:
-        """Convert the data of the file to a `StiffnessAxis`, which tests the stability theorem."""
+        """Convert the data of the file to a `StiffnessAxis`, which tests whether it is stable."""
         return StiffnessAxis(self.mass, self.damping, self.nominal_stiffness, self.min_stiffness, self.max_stiffness)
 
 
@@ -450,7 +450,7 @@ def loop_gain(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: 
         port: the two-port.
         s: (...) complex frequencies [rad/s].
         hand: impedance of the operator's hand.
-        environment: impedance of the task; with a zero impedance the result is Zhu's LG1.
+        environment: impedance of the task.
 
     Returns:
         (...) `(C2 Z_e + C4)(C1 - C3 Z_h) / ((Z_m + C_m + Z_h)(Z_s + C_s + Z_e))` [1], with channels
@@ -501,7 +501,7 @@ def is_passive(port: TwoPort, unit: float = 1.0) -> bool:
 def is_strictly_stable(port: TwoPort, hand: Block, environment: Block) -> bool:
     """Return whether hand, teleoperator and task have only poles in the left half-plane.
 
-    A pole on the imaginary axis, which cannot be counted, makes the loop unstable.
+    The result is also false if a pole lies on the imaginary axis.
     """
     try:
         return is_stable(port, hand, environment)
@@ -517,7 +517,7 @@ def _count_poles_or_none(port: TwoPort, hand: Block, environment: Block) -> int 
 
 
 def find_gain_margin(case: StabilityLoop, structure: str) -> float:
-    """Return the factor on the return channels at which stability changes [1].
+    """Return the factor on the return channels (from slave to master) at which stability changes [1].
 
     For a stable case it is the largest stable factor, infinite if all factors up to 1000 are stable.
     For an unstable case it is below 1, and 0 if no factor down to 0.001 stabilises it.
@@ -575,7 +575,9 @@ def find_first_change(condition: Callable[[float], bool], points: np.ndarray) ->
 
 
 def stability_map(case: StabilityLoop, structure: str, delays: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Test the stability of a control structure on a grid of delays and gains of the return channels.
+    """Test the stability of a control structure on a grid of delays and gains.
+
+    The gains are factors on the return channels, which carry force or motion from slave to master.
 
     Args:
         case: teleoperator with hand and task.

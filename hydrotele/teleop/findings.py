@@ -98,7 +98,10 @@ class SimulatedRun(NamedTuple):
 
 
 def build_control_law(case: TeleoperatorAxis, structure: str, return_gain: float = 1.0) -> ControlLaw:
-    """Return the control law of a structure as coefficients on time signals.
+    """Build the control law of a structure, as coefficients for the time simulation.
+
+    A control force is a sum of ten signals (positions, speeds, accelerations, hand force and their
+    integrals), each multiplied by its coefficient.
 
     Args:
         case: parameters of the teleoperator axis.
@@ -132,10 +135,10 @@ def build_control_law(case: TeleoperatorAxis, structure: str, return_gain: float
 
 
 def impedance_coefficients(impedance: Impedance, position_index: int) -> np.ndarray:
-    """Return the coefficients (10,) with which an impedance acts on a motion, as a force.
+    """Return the coefficients (10,) that give the force of an impedance as a sum of the ten signals.
 
-    Stiffness, damping and mass multiply the signals `position_index`, `position + 1` and `position + 2`:
-    a position and its two derivatives.
+    Stiffness, damping and mass are written at `position_index` and the next two indices, those of a
+    position, its speed and its acceleration. The other coefficients are 0.
     """
     made = np.zeros(10)
     made[position_index : position_index + 3] = impedance.stiffness, impedance.damping, impedance.mass
@@ -244,11 +247,11 @@ def _simulate_case(
 def _build_equations(
     case: TeleoperatorAxis, law: ControlLaw, lags: tuple[int, int], imposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the four linear equations that give the unknown signals at a time step.
+    """Build the four equations for both accelerations, hand force and slave's jerk at a time step.
 
-    Rows: master, hand, slave, and derivative of the slave's equation. The last row is used where the
-    slave's jerk is needed, and is otherwise `w'' = 0`. With `imposed` motion the second row is that
-    of the master's acceleration.
+    Rows: equations of motion of master, hand and slave, and the derivative of the slave's equation.
+    If no force depends on the slave's jerk, the last row sets the jerk to 0. With `imposed` motion
+    the second row sets the master's acceleration instead.
 
     Returns:
         Coefficients (4, 10) on the present signals, and (4, 20) on the delayed ones: ten delayed by
@@ -279,8 +282,10 @@ def _build_equations(
 def _move_undelayed_coefficients(
     there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Subtract the coefficients of channels without delay from those of the present signals `now`.
+    """Move the coefficients of channels without delay to the present signals in the linear equations.
 
+    `there` and `here` are the coefficients of the forward and the return channel on the right-hand
+    side. Those of a channel without delay (`lags` 0) are subtracted from the left-hand side `now`.
     Return the coefficients of both channels on delayed signals, zero for a channel without delay.
     """
     found = []
@@ -355,10 +360,11 @@ def _solve_accelerations_and_force(q, late, inverse, known, delayed, frequency):
 
 @compiled
 def _advance_motion_signals(q, before, step, first):
-    """Advance the signals q (10,) by one step.
+    """Advance the simulated signals q (10,) of master, slave and hand by one time step.
 
-    Speeds and impulse use the second-order Adams-Bashforth formula, their integrals the trapezoidal
-    rule. `before` holds the derivatives of the previous step.
+    Speeds and the integral of the hand's force use the second-order Adams-Bashforth formula, positions
+    and the integral of the master's position the trapezoidal rule. `before` (10,) holds accelerations
+    and force of the previous step and is updated.
     """
     if first:
         before[:] = q

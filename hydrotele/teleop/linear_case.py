@@ -179,7 +179,7 @@ def _tip_mass_and_lever_arms(arm: ArmBalance, row: int) -> tuple[float, np.ndarr
 def _joint_oil_stiffness(arm: ArmBalance, valve: int) -> float:
     """Return the stiffness of a joint due to the oil in its drive's chambers [N m/rad].
 
-    The pose is that of the last `place_mechanism`. Air content is neglected: it lowers the stiffness
+    The pose is the present one of the model `arm`. Air in the oil is neglected: it lowers the stiffness
     in a way that depends on the unknown pressures.
     """
     user = arm.model.user[valve * SLOT_COUNT : (valve + 1) * SLOT_COUNT]
@@ -197,7 +197,7 @@ def _joint_oil_stiffness(arm: ArmBalance, valve: int) -> float:
 def tip_controller_impedance(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray) -> np.ndarray:
     """Return the servo's impedance at the tip: force per velocity error of the tip.
 
-    This is C_s of the module's docstring, with oil, valves, servo and sensor sampling.
+    It results from the stiffness of the oil, the valves' lag, the servo's gains and sensor sampling.
 
     Args:
         tip: linear tip model.
@@ -239,8 +239,9 @@ def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, 
 def _drive_frequency_responses(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
     """Return three frequency responses (..., k) of the k drives at complex frequencies s (...).
 
-    They are valve velocity per command, with the command's delay [1]; the delay of half a sensor
-    sample [1]; and the pressure feedback p V L of the module's docstring [1/s].
+    They are: valve velocity per command, with the command's delay [1]; the delay of half a sensor
+    sample [1]; and the gain of the servo's pressure feedback with its high-pass filter and the two
+    other responses [1/s].
     """
     at = s[..., None]
     valve = tip.bandwidth**2 / (at**2 + 2.0 * tip.damping * tip.bandwidth * at + tip.bandwidth**2)
@@ -322,7 +323,8 @@ class LinearCase:
     def has_force_control(self) -> bool:
         """Whether the simulated operator controls a contact force instead of a position.
 
-        This is the case for operators with a force target, except with a coordinating force.
+        This is the case if the scenario gives the operator a target force, unless the force reflection
+        is `coordinating_force`, a spring between handle and machine.
         """
         pressing = isinstance(self.pilot.operator, RegulateForce | TrackForce)
         return pressing and self.pilot.reflection != "coordinating_force"
@@ -346,8 +348,10 @@ class LinearCase:
         """Return the linear two-port of joystick and machine with a given control structure.
 
         Args:
-            structure: `rate_force`, `position_force`, `rate_position` or `position_position`.
-            return_gain: factor on the return channels, and on the coupling at the master [1].
+            structure: control mode and reflected quantity. In `rate_force` and `position_force` the
+                contact force acts on the handle, in `rate_position` and `position_position` a spring and
+                damper to the machine's position.
+            return_gain: factor on the reflected force, or on that spring and damper [1].
 
         Returns:
             The two-port.
@@ -395,7 +399,10 @@ class LinearCase:
         )  # fmt: skip
 
     def _commanded_velocity(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Return the commanded tip velocity per velocity of the handle, as a frequency response."""
+        """Return the commanded tip velocity per velocity of the handle, as a frequency response.
+
+        It is an integrator under rate control (`rate` true), otherwise a second-order low-pass filter.
+        """
         if rate:
             return self.axis_parameters[GAIN] / s
         return self.axis_parameters[GAIN] * (SMOOTHING_BANDWIDTH / (s + SMOOTHING_BANDWIDTH)) ** 2
@@ -411,11 +418,11 @@ class LinearCase:
         )
 
     def _coupling_impedance(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
-        """Return the force on the hand per velocity error of the machine, with coordinating force.
+        """Return the force on the hand per velocity error of the machine, if they are coupled.
 
-        The spring and damper of the coupling act on the difference between commanded and actual tip
-        position. The force is held for `period` [s]; by default for the sum of the control and the
-        sensor period.
+        With the reflection `coordinating_force`, a spring and a damper act on the difference between
+        commanded and actual tip position. The force is held for `period` [s]; by default for the sum of the
+        control and the sensor period.
         """
         scale = 1.0 if rate else 1.0 / self.axis_parameters[GAIN]
         held = np.exp(-0.5 * (period or self.periods.control_period + self.periods.sensor_period) * s)
@@ -424,7 +431,8 @@ class LinearCase:
     def _reflected_force_response(self, s: np.ndarray) -> np.ndarray:
         """Return the reflected force before scaling per contact force, as a frequency response [1].
 
-        It has the delays of sensor sample and control period, and the two filters of the estimator.
+        It has the delays of sensor sample and control period, and the two filters with which the contact
+        force is estimated. An exactly known force has only the delay of the control period.
         """
         held = np.exp(-0.5 * self.periods.control_period * s)
         if self.pilot.force == "true":

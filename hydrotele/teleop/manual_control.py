@@ -83,7 +83,7 @@ def make_visual_loop(
         expected_gain: expected gain of the element.
         rng: random generator of the observation noise and of the error of the expected gain.
         form: form of the element, known to the operator: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
-        margin: required phase margin [rad]; by default the margin of tracking.
+        margin: required phase margin [rad]; by default `tracking_margin` of the operator.
         threshold: error below which the operator does not act.
         max_output: maximum displacement of the hand.
         steps: number of noise samples before they repeat.
@@ -131,6 +131,9 @@ def _interpolate_past_value(past, tick, back, column):
 @compiled
 def update_controlled_element_fits(loop, tick, late, seen):
     """Update the least-squares gain of every candidate model of the controlled element.
+
+    The controlled element is what responds to the operator's hand; the candidates differ in lag and
+    dead time.
 
     Hand and output pass through a third-order high-pass (wash-out) of bandwidth a, so that slow drift
     does not count. A candidate with n integrations and lag T then predicts the output, for unit gain,
@@ -184,15 +187,17 @@ def update_controlled_element_fits(loop, tick, late, seen):
 
 @compiled
 def estimate_controlled_element_gain(loop):
-    """Estimate the gain of the controlled element: fitted gain, weighted with the expected gain.
+    """Estimate the gain of the controlled element, that is of what responds to the operator's hand.
 
-    Both are weighted by their uncertainty, so that the estimate starts at the expected gain.
+    The estimate is a mean of the gain that fits past observations and the gain that the operator
+    expected, weighted by their uncertainty. It starts at the expected gain.
 
     Args:
         loop: VisualLoop; the estimated gain in `state` is written.
 
     Returns:
-        The gain, scalar, in output per hand displacement (and per s, s^2).
+        The gain, scalar: output, its rate or its second derivative per hand displacement, for an element
+        with no, one or two integrations.
 
     Source: normal posterior of the gain's logarithm.
     """
@@ -264,9 +269,10 @@ def decide_hand_reference(loop, tick, target, seen, hand):
 
 
 def operator_response(operator: Operator, form: int, frequencies: np.ndarray, late: float | None = None) -> np.ndarray:
-    """Return the operator's describing function (hand per error) at frequencies, for unit gain.
+    """Return the frequency response of an operator of unit gain: hand displacement per visible error.
 
-    It contains equalisation, delay and neuromuscular lag.
+    It contains delay, neuromuscular lag and equalisation, the operator's adaptation to the element:
+    integration, no change, or lead.
 
     Args:
         operator: parameters of the operator.
@@ -289,7 +295,8 @@ def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, m
     """Return the maximum operator gain that keeps phase and gain margin, for an element of unit gain.
 
     The element has `form` integrations and the first-order `lag` [s]; `late` is the total delay [s],
-    and `margin` the phase margin [rad]. The crossover frequency has an upper limit, too.
+    and `margin` the phase margin [rad]. The crossover frequency, at which the loop gain is 1, is at most
+    the operator's maximum.
     """
     w = np.geomspace(0.02, 60.0, 4000)
     loop = operator_response(operator, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)

@@ -319,7 +319,8 @@ def compute_reflected_forces(parameters, packet, packet_gain, period, s):
             and of its reference, stiffness, damping and mass of the task.
         packet_gain: factor on the packet, scalar: 1, falling to 0 while the channel is silent.
         period: control period, scalar [s].
-        s: MasterState; `push`, `stiffness`, `integral`, `before` and `line` are written.
+        s: MasterState. The results are `push`, the force of the coils on every axis, and `stiffness`, that
+            of its spring. The states of filters and channel ends are updated.
 
     Returns:
         Nothing.
@@ -405,7 +406,8 @@ def _coordinating_force(row, mode, packet, period, s, i):
 def _passive_channel_force(numbers, row, packet, period, s, i):
     """Return the force of a passive channel against the motion of handle axis i [N], [N m].
 
-    The signal and the energy for the next packet are written to the state.
+    A passive channel uses wave variables or passivity control. What the next packet must contain is
+    written to the state: sum of the waves or handle position, and the energy sent so far.
     """
     c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
     total, budget = sign * packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c]
@@ -424,8 +426,8 @@ def _passive_channel_force(numbers, row, packet, period, s, i):
 def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
     """Return the force on handle axis i with four channels: reflected force and motion coupling.
 
-    Under rate control the channel for the force, `C2 = s / k_v` with the rate gain k_v,
-    differentiates the force below 20 rad/s.
+    Under rate control the reflected force is the derivative of the contact force divided by the rate
+    gain, so that a constant force is not felt. The derivative has a bandwidth of 20 rad/s.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
     x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
@@ -469,7 +471,8 @@ def drive_coils(parameters, quaternion, period, s):
         parameters: MasterParameters.
         quaternion: (4,) orientation of the flotor, scalar first.
         period: control period, scalar [s].
-        s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
+        s: MasterState. The results are `currents`, `limited` (factor by which they were scaled down) and
+            `hand`, the estimated hand force; `momentum` is the state of its observer.
 
     Returns:
         Nothing.
@@ -582,8 +585,8 @@ def compute_tip_over_protection(
 ) -> None:  # fmt: skip
     """Compute a force on the handle's vertical axis that keeps the machine from tipping.
 
-    The force is an additional spring to the centre, with the damper that a 200 Hz control needs. It
-    acts only in the direction that increases the tipping moment. It brings the handle back into the
+    The force is that of an additional spring and damper to the centre. It acts only while the handle is
+    deflected in the direction that increases the tipping moment. It brings the handle back into the
     dead band and never commands a motion.
 
     Args:

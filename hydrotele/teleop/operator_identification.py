@@ -280,11 +280,12 @@ def _filter_with_transfer_function(values: np.ndarray, step: float, response) ->
 def _estimate_instrumental_variable(
     target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
-    """Estimate the part of the error `seen` that the target causes, as instrumental variable.
+    """Estimate the part of the tracking error that the target causes, as instrumental variable.
 
-    The impulse response from target to error is fitted by least squares to the rows in `kept`. Each
-    part of the record uses the response that is fitted to the other parts, so that its own remnant is
-    not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
+    This part contains none of the operator's own noise (remnant). The impulse response from target to
+    the error `seen` is fitted by least squares to the rows in `kept`. Each part of the record uses the
+    response that is fitted to the other parts, so that its own remnant has no influence (jackknife
+    instrumental variables, Angrist et al. 1999).
     """
     apart = max(1, round(_TAP_SPACING / step))
     lags = np.arange(0, round(_RESPONSE_LENGTH / step), apart)
@@ -313,9 +314,10 @@ def _parameter_names(kind: str) -> tuple[str, ...]:
 
 
 def _operator_response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Return the operator's describing function Yp, hand per error, at complex frequencies s.
+    """Return the operator's describing function Yp, hand displacement per error, at complex frequencies s.
 
-    `kind` is the equalisation, and `logs` are the logarithms of its parameters.
+    `kind` is the form of the operator's compensation: gain, lead, lag or integral. `logs` are the
+    logarithms of the model's parameters.
     """
     p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
@@ -351,9 +353,9 @@ def _predict_hand_motion(data: _TrackingData, kind: str, logs: np.ndarray, value
 
 
 def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
-    """Fit an autoregression to a noise and return its whitening filter.
+    """Fit an autoregression to a noise and return the filter that makes the noise white.
 
-    The filter is 1, followed by the negative autoregression coefficients.
+    Its coefficients are 1, followed by the negative autoregression coefficients.
     """
     from scipy.linalg import solve_toeplitz
 
@@ -420,11 +422,13 @@ def _build_instrumental_equations(
     data: _TrackingData, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
     instrument: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Build the instrumental-variable equations at the present parameters.
+    """Build the instrumental-variable equations of the operator model at the present parameters.
 
-    Return whitened instruments (n, m + 1), whitened derivatives (n, m + 1) of the predicted hand by
-    the m logarithms, and the whitened remnant (n,). The last column is the response of the high-pass
-    to an initial displacement of the hand, which lasts longer than the discarded rows.
+    Return the instruments (n, m + 1), the derivatives (n, m + 1) of the predicted hand motion by the
+    logarithms of m parameters, and the unexplained hand motion (n,). All are filtered so that the
+    unexplained motion becomes white noise. The instruments are the same derivatives, but free of the
+    operator's noise. The last column of both is the effect of one more unknown, the hand's displacement
+    at the start.
     """
     from scipy.signal import lfilter
 
@@ -444,18 +448,23 @@ def _build_instrumental_equations(
 
 
 def _solve_instrumental_equations(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Solve the instrumental-variable equations `z^T (rest - d x) = 0` for the parameter step x."""
+    """Solve the instrumental-variable equations `z^T (rest - d x) = 0` for the parameter step x.
+
+    z are the instruments, d the derivatives of the predicted hand motion by the parameters, and `rest`
+    the hand motion that the model does not explain.
+    """
     scale = np.linalg.norm(z, axis=0) + 1e-300
     matrix, right = (z / scale).T @ (d / scale), (z / scale).T @ rest
     return np.linalg.lstsq(matrix, right, rcond=1e-10)[0] / scale
 
 
 def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
-    """Return the covariance of the parameters' logarithms, enlarged to variances of a jackknife.
+    """Return the covariance of the logarithms of an operator's fitted parameters.
 
-    The first estimate assumes a stationary whitened remnant and a known instrument. The jackknife
-    leaves out each part of the record in turn and estimates instrument and parameters again, since
-    the remnant varies with the error and is also in the instrument.
+    Of two estimates of each variance the larger one is used. The first follows from the residual and
+    assumes that the part of the error that the target causes (the instrument) is known. The second is
+    that of a jackknife: each part of the record is left out in turn, and instrument and parameters are
+    estimated again.
     """
     arguments = data, fit.kind, fit.log_parameters, fit.sign, fit.whitening_filter
     z, d, rest = _build_instrumental_equations(*arguments, data.target_error)
@@ -486,7 +495,11 @@ def _build_operator_fit(
     fit: _EqualisationFit, data: _TrackingData, signals: Mapping[str, np.ndarray], record: TrackingRecord,
     notes: list[str],
 ) -> OperatorFit:  # fmt: skip
-    """Build the user's result from a fit: estimates with intervals, remnant, crossover and margins."""
+    """Build the user's result from a fit of the operator model.
+
+    It contains all estimates with intervals: parameters, the operator's noise (remnant), crossover
+    frequency and stability margins.
+    """
     errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     estimates: dict[str, ParameterEstimate] = {}
     for name, log, error in zip(fit.names, fit.log_parameters, errors, strict=True):
@@ -520,7 +533,7 @@ def _make_parameter_estimate(log: float, error: float, unit: str, inside: bool =
 
 
 def _estimate_remnant(fit: _EqualisationFit, data: _TrackingData) -> ParameterEstimate:
-    """Estimate the operator's remnant, a noise-to-signal ratio [1].
+    """Estimate the operator's observation noise (remnant), as a noise-to-signal ratio [1].
 
     It is the power density of the observation noise divided by pi times the variance of the observed
     error (and of its rate for an operator who generates lead).

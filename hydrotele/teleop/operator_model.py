@@ -200,7 +200,8 @@ def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
     """Compute the muscle forces on the handle in one control period from its reference displacement.
 
     Args:
-        muscles: NeuromuscularState; `correction`, `force`, `rest` and `rate` are written.
+        muscles: NeuromuscularState. The result is `force`, the force on the handle; `rest` and `rate` (rest
+            position of the arm and its rate) and `correction` (learnt force) are updated.
         history: (d + 1, 6) ring buffer of handle displacements for a reflex delay of d periods,
             written [m], [rad].
         tremor: (n, 6) tremor forces [N], [N m].
@@ -482,10 +483,11 @@ class OperatorModel:
             self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[MIN_STIFFNESS]
 
     def _felt_load_stiffness(self, axis: int, way: float, felt: int) -> float:
-        """Return the handle's stiffness that the muscles last worked against [N/m].
+        """Return the stiffness of the handle that the muscles felt last [N/m].
 
-        `felt` is the tick of the delayed observation. The result is free of perception errors, since
-        reflexes need no judgement; muscle noise is in the tremor.
+        It is the ratio of hand force to displacement at the tick `felt`, within the joystick's range of
+        stiffness. Near the centre the previous value is kept. The result is free of perception errors,
+        since reflexes need no judgement.
         """
         row, x = self._target.axis_parameters, float(self._handle[felt, axis])
         if way * x > _MIN_FELT_DISPLACEMENT:
@@ -497,7 +499,8 @@ class OperatorModel:
     def _force_variance(self, row: list[float], force: float) -> float:
         """Return the variance that the operator assumes for an observed contact force [N^2].
 
-        It follows from display noise or from Weber fractions, depending on the force reflection.
+        It follows from the noise of the display if the contact force is displayed, otherwise from the
+        relative errors (Weber fractions) of a felt stiffness or force.
         """
         him, largest = self.parameters, self._target.tolerance / _FORCE_TOLERANCE_RATIO
         if self._target.is_force_displayed:
@@ -550,10 +553,11 @@ class OperatorModel:
         )
 
     def _push_with_target_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
-        """Build up the hand force that direct reflection returns at the target, for force control.
+        """Push the handle with the hand force that balances the reflected force at the target.
 
-        The reference follows the handle, so that the handle moves freely. `goal` is the target
-        contact force [N], and `reflex` the tick of the delayed handle position.
+        It is the target contact force `goal` [N] times the reflection ratio, in the direction `way`,
+        and is built up gradually. The position reference follows the handle's position at the tick
+        `reflex`, so that the operator controls a force and no position.
         """
         share = 1.0 - math.exp(-self._step / _FORCE_BUILDUP_TIME)
         wish = way * row[REFLECTION_RATIO] * goal
@@ -562,9 +566,9 @@ class OperatorModel:
         self.muscles.reference[axis] = self._handle[reflex, axis]  # force control
 
     def _displacement_beyond_deadband(self, axis: int, tick: int) -> float:
-        """Return the handle displacement that commands motion, with the sign of the coordinate.
+        """Return the handle displacement that commands motion, with the sign of the coordinate [m], [rad].
 
-        Under rate control it is the displacement beyond the dead band [m] or [rad].
+        Under rate control it is the displacement beyond the dead band, otherwise the whole displacement.
         """
         row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
         if self._pilot.mode == "rate":
@@ -696,8 +700,9 @@ def _make_arm_at_rest(
 ) -> NeuromuscularState:
     """Create parameters and initial state of the operator's arm and muscles, at rest.
 
-    A given path is the path of the hand itself, after the neuromuscular lag. A hand that applies a
-    force to the handle follows it by its compliance, which is part of the arm.
+    The neuromuscular lag is set only for an operator who chooses the handle's position from a goal. A
+    given path already is that of the hand. An operator who pushes against a directly reflected force
+    has no lag either, since the arm's compliance lets the hand follow the handle.
     """
     hand, lagging = (
         joystick.hand,

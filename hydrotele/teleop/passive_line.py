@@ -162,9 +162,10 @@ def step_passivity_master(v, force, slave_energy, mass, period, end_state):
 
 @compiled
 def _power_dissipating_force(v, force, power, most):
-    """Return a damping force against speed v that dissipates a power, at most `most` times the speed.
+    """Return a damping force against the speed v that dissipates the power `power` [W].
 
-    It is the received force `force` if that dissipates more.
+    If the received force `force` dissipates more, it is returned instead. The magnitude of the result is
+    at most `most` [N s/m] times the speed.
     """
     speed = abs(v)
     if speed == 0.0:

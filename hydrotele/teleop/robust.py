@@ -164,7 +164,7 @@ def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndar
 
 
 def port_with_task(case: TeleoperatorAxis, structure: str, task: Impedance) -> TwoPort:
-    """Return the linear two-port of a structure, after replacing the task of the case."""
+    """Return the linear two-port of a control structure for a teleoperator that acts on `task`."""
     return replace(case, task=task).make_port(structure)
 
 
@@ -184,14 +184,13 @@ class MasterPolynomial:
 def compute_master_polynomial(
     case: TeleoperatorAxis, structure: str, hand: Impedance = _ZERO_IMPEDANCE
 ) -> MasterPolynomial:
-    """Compute the characteristic polynomial of the master without return channels.
+    """Compute the characteristic polynomial of the master alone, without signals from the slave.
 
-    The master is held by a hand (h) or released. Z_m is the master's impedance and C_m its controller
-    with damping B_mc and stiffness K_mc. Under position control, and rate control with direct force,
-    `Z_m + C_m + Z_h = 0`. If the master's controller acts on the integral,
-    `Z_m + C_m / (K_v s) + Z_h = 0` and, when released,
-    `K_v M s^3 + K_v B s^2 + (K_v K + B_mc) s + K_mc = 0` with the master's own M, B and K. Without
-    own damping B it cannot be stable. K_v of the source is the inverse of the velocity gain here.
+    M, B and K are mass, damping and stiffness of master and hand together; the master's controller has
+    damping B_c and stiffness K_c. Under position control, and in `rate_force`, the polynomial is
+    `M s^2 + (B + B_c) s + K + K_c`. In the other structures under rate control the controller acts on
+    the integral of the position times the velocity gain k. The polynomial is then
+    `M s^3 / k + B s^2 / k + (K / k + B_c) s + K_c`, which is unstable for B = 0.
 
     Args:
         case: the teleoperator.

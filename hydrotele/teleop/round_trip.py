@@ -78,17 +78,22 @@ def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
             lost.
 
     Returns:
-        (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Before the first
-        arrival it is the longest delay.
+        (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Until the first
+        arrival, but not beyond the longest delay, it is the longest delay, as if packets had been sent
+        before the first period.
 
     >>> compute_arriving_ages(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
+    >>> compute_arriving_ages(np.array([-1, -1, -1, 1, 1])).tolist()  # the packet of period 1 is lost
+    [1, -1, -1, -1, 1]
     """
     delays = np.asarray(delays)
     ages, ticks = compute_packet_ages(delays), np.arange(len(delays))
     newest = ticks - ages
     fresh = np.diff(newest, prepend=-1) > 0
-    return np.where(newest < 0, max(int(delays.max()), 0), np.where(fresh, ages, -1))
+    longest = max(int(delays.max()), 0)
+    before_start = (newest < 0) & (ticks < longest)
+    return np.where(before_start, longest, np.where((newest >= 0) & fresh, ages, -1))
 
 
 def delays_to_periods(delays: np.ndarray, period: float) -> np.ndarray:
@@ -209,7 +214,8 @@ def step_master_side(tick, has_new_sample, elapsed, tripped, machine, line, oper
     """Run the first half of a control tick, up to the forces on the joystick's handle.
 
     The machine's packet is written to the channel, the master receives the newest packet, and the coil
-    currents and the operator's muscle forces are computed. The master's packet is written.
+    currents and the operator's muscle forces are computed. The master's packet is written to the
+    channel.
 
     Args:
         tick: number of the control tick, scalar.
@@ -276,7 +282,7 @@ def step_slave_side(tick, machine, line, grid, table, scale, reference, rate, dr
         line: ChannelBuffers.
         grid: (nu, 2) lowest joint position and step of the table, from `tabulate_drives`.
         table: (nu, points, 3) moment arms and chamber volumes, from `tabulate_drives`.
-        scale: factor on the drive velocities, scalar.
+        scale: factor on the reference velocities of the drives, the servo's feedforward, scalar.
         reference: (nu,) joint references, those of the arm written [rad] or [m].
         rate: (nu,) rates of the joint references [rad/s] or [m/s].
         drive: DriveReference, written.
@@ -326,7 +332,7 @@ STATION_DTYPE = np.dtype(
 
 @compiled
 def _unpack_record(r):
-    """Return SlaveSide, ChannelBuffers and MasterSide as views of the arrays of a STATION_DTYPE record."""
+    """Return SlaveSide, ChannelBuffers and MasterSide: views of the arrays to whose addresses a record refers."""
     k, rows, back = r.joints, r.forward_rows, r.back_rows
     machine = SlaveSide(
         float64_view(r.joint, r.axes), float64_view(r.force, k), int64_view(r.columns, k),

@@ -145,22 +145,25 @@ class _SampledSide:
 
     @property
     def rate(self) -> np.ndarray:
-        """Numerator of the speed as a controller computes it: backward difference of the position."""
+        """Transfer function from force to the speed that a controller computes, times `denominator`.
+
+        This speed is the backward difference of the position.
+        """
         return self.position * (1.0 - self.q) / self.period
 
     def digital_controller_force(self, z: Impedance) -> np.ndarray:
-        """Return the force of a digital controller with mass, damping and stiffness z.
+        """Return the force of a digital controller, with mass, damping and stiffness z, on this side.
 
-        It uses sampled positions, their differences, and the measured acceleration; a numerator over
-        `denominator`.
+        It multiplies sampled position, its difference and the measured acceleration by z. The result is
+        a transfer function from the force on this side, times `denominator`.
         """
         return z.mass * self.acceleration + z.damping * self.rate + z.stiffness * self.position
 
     def physical_force(self, z: Impedance) -> np.ndarray:
         """Return the force of a body with impedance z that moves with this side, as a sensor measures it.
 
-        It uses true speed and acceleration just before a step of the force; a numerator over
-        `denominator`.
+        It follows from true speed and acceleration just before a step of the force. The result is a
+        transfer function from the force on this side, times `denominator`.
         """
         return z.mass * self.acceleration + z.damping * self.speed + z.stiffness * self.position
 
@@ -198,7 +201,8 @@ def sampled_characteristic_function(
 
     Args:
         case: teleoperator with hand and task; its delays are replaced by those of the channel.
-        structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
+        structure: one of `SAMPLED_STRUCTURES`; for `passivity_control` the loop without the limits on
+            energy.
         line: control period and distribution of the ages of packets.
         q: (...) complex points.
         return_gain: factor on the return channels [1].
@@ -232,9 +236,10 @@ def sampled_characteristic_function(
 
 
 def _mean_channel_response(share: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Evaluate the mean channel `E(q) = sum of share[n] q^n` at points q, by Horner's rule.
+    """Evaluate the mean response `E(q) = sum of share[n] q^n` of a channel, by Horner's rule.
 
-    `share[n]` is the fraction of the periods in which the packet is n periods old.
+    `share[n]` is the fraction of the periods in which the packet is n periods old, and q are points of
+    the unit delay.
     """
     total = np.zeros_like(q)
     for part in share[::-1]:
@@ -243,18 +248,20 @@ def _mean_channel_response(share: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _mean_return_response(line: PacketAges, q: np.ndarray) -> np.ndarray:
-    """Evaluate the mean return channel E(q) if the slave answers packets of the same period.
+    """Evaluate the mean return channel E(q) of a slave that acts after the master in every period.
 
-    A packet from the slave of age 0 then counts as one of age 1.
+    The master can then use the slave's packet in the next period at the earliest: a packet of age 0
+    counts as one of age 1. E(q) is the mean of q^age over the periods.
     """
     return _mean_channel_response(line.back, q) - line.back[0] * (1.0 - q)
 
 
 def _master_side_forces(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> tuple[np.ndarray, np.ndarray]:
-    """Return the forces of the control law that depend on the master's motion.
+    """Return the two forces that a control structure computes from the master's motion.
 
-    They are the force of the master's own controller, and the force on the slave before the channel.
-    Both are numerators over the master's denominator, multiplied by `1 - q` under rate control.
+    They are the force of the master's own controller, and the force on the slave before the forward
+    channel. Both are transfer functions from the force on the master, times its denominator, and under
+    rate control times `1 - q`.
     """
     firm, own, gains = case.slave_control, case.master_control, case.gains
     if structure not in RATE_STRUCTURES:
@@ -280,9 +287,10 @@ def _master_side_forces(case: TeleoperatorAxis, structure: str, near: _SampledSi
 
 
 def _slave_side_force(case: TeleoperatorAxis, structure: str, far: _SampledSide) -> np.ndarray:
-    """Return the force on the master that depends on the slave's motion, before the return channel.
+    """Return the force on the master that a structure computes from the slave's motion.
 
-    It is a numerator over the slave's denominator.
+    The return channel follows. The result is a transfer function from the force on the slave, times the
+    slave's denominator.
     """
     if structure in ("position_force", "rate_force"):
         return -case.gains.force * far.physical_force(case.task)
@@ -303,10 +311,11 @@ def _series_characteristic(
     ahead: np.ndarray,
     home: np.ndarray,
 ) -> np.ndarray:
-    """Return the characteristic function if only the slave has a controller and returns its force.
+    """Return the characteristic function of a sampled loop with wave variables or passivity control.
 
-    With `waves` the channel carries wave variables, otherwise velocity and force. `ahead` and `home`
-    are the mean responses of the forward and the return channel.
+    In both structures only the slave has a controller, whose force is returned to the master. With
+    `waves` the channel carries wave variables, otherwise velocity and force, without the limits of
+    passivity control. `ahead` and `home` are the mean responses of the forward and the return channel.
     """
     step, firm = 1.0 - near.q, case.slave_control
     held = firm.damping * step + firm.stiffness * near.period  # C = held / step
@@ -333,7 +342,8 @@ def compute_max_growth_rate(
 
     Args:
         case: teleoperator with hand and task; its delays are replaced by those of the channel.
-        structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
+        structure: one of `SAMPLED_STRUCTURES`; for `passivity_control` the loop without the limits on
+            energy.
         line: control period and distribution of the ages of packets.
         return_gain: factor on the return channels [1].
 
@@ -341,7 +351,8 @@ def compute_max_growth_rate(
         Rate sigma of the motion `exp(sigma t)` [1/s], between -2000 and 2000.
 
     Raises:
-        InputError: the structure is not known, or a pole lies on the contour.
+        InputError: the structure is not known, or a pole lies on the circle in
+            which poles are counted.
     """
     return _find_growth_rate(lambda q: sampled_characteristic_function(case, structure, line, q, return_gain), line)
 
@@ -415,7 +426,11 @@ def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
 
 
 def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
-    """Return the transfer functions of master and slave from received to sent signal, at points q."""
+    """Return two transfer functions, of the master and of the slave, from received to sent signal.
+
+    The signals are those of the channel between them: forces, or waves for wave variables. q are points
+    of the unit delay, and `reflected` is a factor on the returned force.
+    """
     near = _make_sampled_side(case.master, case.hand, line.period, q)
     far = _make_sampled_side(case.slave, case.task, line.period, q)
     if structure == WAVE_STRUCTURE:
@@ -515,7 +530,8 @@ def predict_stability(
         Whether it is stable, and the criterion that decided.
 
     Raises:
-        InputError: the structure is not known, or a pole lies on the contour.
+        InputError: the structure is not known, or a pole lies on the circle in
+            which poles are counted.
     """
 
     def loop_function(q: np.ndarray) -> np.ndarray:

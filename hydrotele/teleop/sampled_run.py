@@ -66,9 +66,10 @@ class KickResponse(NamedTuple):
 
 
 def control_coefficients(case: TeleoperatorAxis, structure: str, return_gain: float = 1.0) -> np.ndarray:
-    """Return the control laws of a structure as coefficients on the seven signals of each side.
+    """Return the control laws of a structure as coefficients on seven sampled signals of each side.
 
-    The signals are those that the constants SUM to FORCE of this module number.
+    The signals are sum of positions, position, its difference, acceleration, sum and difference of the
+    force on hand or task, and that force.
 
     Args:
         case: the teleoperator.
@@ -160,8 +161,9 @@ _MIN_GROWTH_RATIO = 1.05  # ratio of late to early motion above which motion gro
 
 
 def _is_growing(largest: np.ndarray) -> bool:
-    """Return whether the largest speed (40,) of the last quarter of a run exceeds the second one's.
+    """Return whether speeds grow: the maximum of a run's last quarter exceeds that of its second one.
 
+    `largest` (40,) are the maximum speeds of the parts of the run.
     After an early stop the last speed is compared with the initial one.
     """
     reached = int(np.count_nonzero(largest > 0.0))
@@ -229,7 +231,11 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
 
 @compiled
 def _sample_side_signals(body, state, force, period, seen):
-    """Update the seven signals `seen` of a side from its state, just before its force changes."""
+    """Update the sampled signals `seen` (7,) of master or slave from its state.
+
+    They are position, its sum and difference, acceleration, the force on hand or task, and the sum and
+    difference of that force. The sample is taken just before the force on the side changes.
+    """
     x, v = state[0], state[1]
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
     a = (force - damping * v - stiffness * x) / mass
@@ -248,9 +254,10 @@ PACKET_SIGNAL, PACKET_ENERGY = range(2)
 
 @compiled
 def _read_packet(sent, row, n):
-    """Return signal and energy of the packet sent in period `row`, at the latest in period n.
+    """Return the two values of the packet that was sent in period `row`, at the latest in period n.
 
-    Both are 0 before the first arrival (`row` negative).
+    They are the signal (sum of waves, position or force) and the energy. Both are 0 before the first
+    arrival (`row` negative).
     """
     if row < 0:
         return 0.0, 0.0

@@ -241,7 +241,7 @@ def measure_tip(parameters, joint, fresh, elapsed, s):
         joint: (k,) measured joint angles [rad].
         fresh: whether there is a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
-        s: SlaveState; `measured` is written.
+        s: SlaveState; pose and rate are written to `measured`, unless there is no new sample.
 
     Returns:
         Nothing.
@@ -381,9 +381,9 @@ def _four_channel_rate(numbers, row, c, x, v, hand, force, period, s):
     """Return the rate of coordinate c with four channels: that of a virtual mass M.
 
     Hand force, contact force F and a spring K and damper B to the handle's position x move the mass.
-    Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
-    under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`; y is the
-    position of the coordinate and k_v the rate gain.
+    Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale.
+    Under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`; y is the
+    position of the coordinate, k_v the rate gain, and `int` the integral over time.
     """
     gain, spring, damper = row[AXIS_GAIN], row[SPRING], row[DAMPER]
     mass = numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
@@ -407,7 +407,8 @@ def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
     """Return the rate of coordinate c with a passive channel: that of a virtual mass M.
 
     The force `pull` of the channel's slave end and the scaled contact force F move the mass:
-    `M z'' = pull + ratio F`. `total` and `budget` are signal and energy of the received packet.
+    `M z'' = pull + ratio F`, with z the motion in the scale of the handle. The received packet gives
+    `total`, the sum of the master's waves or the handle position, and `budget`, the energy sent.
     """
     gain, spring, damper, end = row[AXIS_GAIN], row[SPRING], row[DAMPER], s.line[c]
     speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
@@ -434,7 +435,7 @@ def check_following_error(parameters, joint, s):
     Args:
         parameters: SlaveParameters.
         joint: (k,) measured joint angles [rad]; a value that is not finite also closes the valves.
-        s: SlaveState; `flags` is written.
+        s: SlaveState; the flag that closes the valves is set in `flags`.
 
     Returns:
         Nothing.
@@ -450,8 +451,10 @@ def check_following_error(parameters, joint, s):
 def write_machine_packet(parameters, force, s, packet):
     """Write the packet from the machine to the master: tip force, positions and speeds.
 
-    Positions are relative to the start. A passive channel replaces the reference by signal and energy
-    of the channel; with four channels the reference replaces the measured motion.
+    Positions are relative to the start. The rows are tip force, measured position and speed of the tip,
+    and its reference position and speed. With four channels the reference is sent in place of the
+    measured motion. With wave variables or passivity control the returned signal (sum of waves or force)
+    and its energy are sent in place of the reference.
 
     Args:
         parameters: SlaveParameters.

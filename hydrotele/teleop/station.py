@@ -259,7 +259,7 @@ class TeleoperationSystem:
         """Write the sizes of all arrays and the settings of the run to the record of the compiled loop.
 
         `swing` is the degree of freedom that moves the cab with the joystick, -1 for a fixed joystick;
-        `scale` is the factor on the drive velocities.
+        `scale` is the servo's feedforward, a factor on the reference velocities of the drives.
         """
         sizes = {name: len(array) for name, array in self._arrays.items()}
         for name, value in {

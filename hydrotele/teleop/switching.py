@@ -98,7 +98,7 @@ class StiffnessAxis:
 
     @property
     def half_swing_growth(self) -> float:
-        """Factor by which the worst switching changes the speed in half a swing [1]; stable below 1."""
+        """Factor by which the worst stiffness switching changes the speed in half a swing [1]; stable below 1."""
         return worst_switching_growth(self.mass, self.damping, self.min_stiffness, self.max_stiffness)
 
     @property
@@ -138,7 +138,9 @@ def worst_switching_growth(mass: float, damping: float, min_stiffness: float, ma
 
 
 def compute_switching_growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
-    """Compute the speed growth under the worst switching on a grid of damping and upper stiffness.
+    """Compute the growth of an oscillation's speed on a grid of damping and maximum stiffness.
+
+    The stiffness switches between its bounds in the worst way: low outwards, high inwards.
 
     Args:
         mass: mass of the axis [kg].

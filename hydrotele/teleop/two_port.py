@@ -245,8 +245,9 @@ def characteristic_function(port: TwoPort, s: np.ndarray | complex, hand: Block,
         environment: impedance of the task.
 
     Returns:
-        (...) `(Z_m + C_m + Z_h)(Z_s + C_s + Z_e) + (C2 Z_e + C4)(C1 - C3 Z_h)` [(N s/m)^2], with
-        impedances Z of master m, slave s, hand h and environment e.
+        (...) `(Z_m + C_m + Z_h)(Z_s + C_s + Z_e) + (C2 Z_e + C4)(C1 - C3 Z_h)` [(N s/m)^2]. Z
+        are impedances, C_m and C_s controllers, C1 .. C4 the channels of `TwoPort`; indices m master, s
+        slave, h hand, e environment.
 
     Source: Zhu 1994, 3.13.
     """

@@ -221,6 +221,8 @@ def law(
 ) -> Any:  # fmt: skip
     """Register a function as a law under its name; decorator.
 
+    A law adds a force, a flow or a command to a drive of a machine, as a function of its state.
+
     Args:
         function: `(state, *parameters) -> float`, with annotations as in the module docstring.
         check: function that raises ValueError for invalid parameters.
@@ -413,13 +415,16 @@ def _make_formula_error(text: str, why: str) -> ValueError:
 
 @law
 def constant(s: DriveState, value: float) -> float:
-    """Return a constant contribution to the balance, `value` in the unit of the balance."""
+    """Return a constant additional force, flow or command of a drive.
+
+    `value` has the unit of what it is added to: [N], [N m], [m^3/s], [1] or [V].
+    """
     return value
 
 
 @law
 def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
-    """Return a pulse over time: `size` from `start` [s] for a `duration` [s], otherwise 0.
+    """Return a pulse of force, flow or command: `size` from `start` [s] for a `duration` [s], else 0.
 
     The edges are half cosine waves, centred on start and end; their length is the fraction `edge`
     of the duration. The pulse is thus differentiable with respect to every parameter.
@@ -441,13 +446,24 @@ def pulse(s: DriveState, size: float, start: float, duration: float, edge: float
 
 @law
 def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
-    """Return a ramp over time: 0 until `start` [s], then growing by `rate` per second."""
+    """Return an additional force, flow or command: 0 until `start` [s], then growing by `rate` per s."""
     return rate * max(0.0, s.time - start)
 
 
-@law
+def _check_divisors(given: Parameters) -> None:
+    """Raise ValueError for a time constant, width or smoothing range that is not positive; laws divide by them."""
+    for name in ("time_constant", "width", "smoothing_velocity", "smoothing"):
+        value = given.get(name, 1.0)
+        if isinstance(value, (int, float)) and not value > 0.0:
+            raise ValueError(f"{name} must be positive, not {value!r}")
+
+
+@law(check=_check_divisors)
 def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
-    """Return a drift from 0 to `value`, `value (1 - exp(-t / time_constant))`, with t the time [s]."""
+    """Return an additional force, flow or command that drifts exponentially from 0 to `value`.
+
+    It is `value (1 - exp(-t / time_constant))`, with t the time [s].
+    """
     return value * (1.0 - math.exp(-s.time / time_constant))
 
 
@@ -478,9 +494,9 @@ def _check_bilinear_table(given: Parameters) -> None:
 
 @law(check=_check_table)
 def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers) -> float:
-    """Interpolate a table linearly in one state variable.
+    """Interpolate an additional force, flow or command linearly in one state variable of a drive.
 
-    `points` [unit of the variable] increase; `values` are the contributions to the balance at these
+    `points` [unit of the variable] increase, and `values` are the forces, flows or commands at these
     points. Beyond the first and the last point the value is constant.
 
     >>> import numpy as np
@@ -509,7 +525,9 @@ def bilinear_table(
     s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
     column_points: Numbers, values: Numbers,
 ) -> float:  # fmt: skip
-    """Interpolate a table bilinearly in two state variables; constant beyond the outer points.
+    """Interpolate an additional force, flow or command bilinearly in two state variables of a drive.
+
+    The value is constant beyond the outer points.
 
     `values` has one row for each of the `row_points`, and one column for each of the
     `column_points`; the compiled law receives it row by row.
@@ -592,7 +610,7 @@ def quadratic_drag(s: DriveState, coefficient: float) -> float:
     return -coefficient * s.velocity * abs(s.velocity)
 
 
-@law
+@law(check=_check_divisors)
 def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) -> float:
     """Return dry friction of seals and guides that is proportional to the drive's load.
 
@@ -604,7 +622,7 @@ def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) 
     return -coefficient * abs(s.force) * math.tanh(s.velocity / smoothing_velocity)
 
 
-@law
+@law(check=_check_divisors)
 def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float) -> float:
     """Return dry friction around one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`.
 
@@ -615,7 +633,7 @@ def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, sm
     return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
 
 
-@law
+@law(check=_check_divisors)
 def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
     """Return the turbulent leakage from the head-side into the rod-side chamber [m^3/s].
 
@@ -629,7 +647,7 @@ def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
     return flow_gain * drop / math.sqrt(math.sqrt(drop * drop + smoothing * smoothing))
 
 
-@law
+@law(check=_check_divisors)
 def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: float) -> float:
     """Return the change of viscous friction while the oil's viscosity drifts, `-b (m(t) - 1) v`.
 
@@ -641,7 +659,7 @@ def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: fl
     return -viscous * change * s.velocity
 
 
-@law
+@law(check=_check_divisors)
 def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: float) -> float:
     """Return the change of laminar leakage while the oil's viscosity drifts [m^3/s].
 

@@ -259,7 +259,7 @@ def _get_law_input(terms, at, k, value, s, drives):
 
 @compile_without_allocation
 def _hysteresis_state(terms, at, drives):
-    """Return the internal state of a term's hysteresis, scalar [1]; 0 if no activation holds it."""
+    """Return the internal state of a term's hysteresis, scalar [1]; 0 if the simulator stores none."""
     place = int(terms[at + _STATE_INDEX])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
@@ -376,11 +376,11 @@ _window_factor = compile_without_allocation(window_factor)
 
 @compile_without_allocation
 def has_term(terms, balance, axis):
-    """Return whether any term adds to a balance of a drive; otherwise its sum need not be computed.
+    """Return whether any term adds to the force, to a flow or to the command of a drive.
 
     Args:
         terms: (n,) table of `encode_terms_table`.
-        balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
+        balance: what the terms add to: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator, or ANY_DRIVE.
 
     Returns:
@@ -397,11 +397,11 @@ def has_term(terms, balance, axis):
 
 @compile_without_allocation
 def sum_terms(terms, balance, axis, s, drives):
-    """Return the sum of the laws of all terms that add to a balance of a drive.
+    """Return the sum of all terms that add to the force, to a flow or to the command of a drive.
 
     Args:
         terms: (n,) table of `encode_terms_table`.
-        balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
+        balance: what the terms add to: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator.
         s: DriveState of the drive.
         drives: Drives, for variables of other drives and hysteresis states.
@@ -478,7 +478,7 @@ def sum_terms_with_slope(terms, balance, axis, s, drives):
         drives: Drives, for variables of other drives.
 
     Returns:
-        (sum [unit of the balance], d sum / d velocity), the second by a forward difference.
+        (sum [N], [N m], [1] or [V]; its derivative by the velocity), the second by a forward difference.
     """
     value = sum_terms(terms, balance, axis, s, drives)
     step = _VELOCITY_STEP * (1.0 + abs(s.velocity))
@@ -488,7 +488,9 @@ def sum_terms_with_slope(terms, balance, axis, s, drives):
 
 @compile_without_allocation
 def sum_flow_terms(terms, axis, s, drives):
-    """Return the flows that terms add to both chambers of a drive, and their pressure derivatives.
+    """Return the flows that a machine's terms add to both chambers of a drive, and their derivatives.
+
+    The derivatives are those of each flow by the pressure of its chamber.
 
     Args:
         terms: (n,) table of `encode_terms_table`.

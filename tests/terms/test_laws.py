@@ -300,6 +300,8 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
         ("formula", {"played": 1.0}, "'played' is not a variable; it is now called 'play_output'"),
         ("linear_table", {"variable": "ahead", "points": [0, 1], "values": [0, 1]},
          "'ahead' is not a variable; it is now called 'play_difference'"),
+        ("load_friction", {"coefficient": 0.02, "smoothing_velocity": 0.0}, "smoothing_velocity must be positive"),
+        ("exponential_drift", {"value": 1.0, "time_constant": -1.0}, "time_constant must be positive, not -1.0"),
         ("formula", {}, "at least one product"),
         ("formula", {"velocity +": 1.0}, "it cannot be parsed"),
         ("formula", {"speed": 1.0}, "'speed' is not a variable"),

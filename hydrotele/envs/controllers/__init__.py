@@ -1,1 +1,1 @@
-"""Baseline controllers, which use only the observation and the nominal machine."""
+"""Baseline controllers, which use only the observation and the parameters of the machine without effects."""

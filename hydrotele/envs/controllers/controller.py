@@ -3,8 +3,8 @@
 `find_observation_columns` finds the observation columns of named fields. `ValveServo` computes valve commands at the
 environment rate with the joint servo of `control.servo`: velocity feedforward through the flow gain
 at the measured pressures, dead-band compensation, position feedback and dynamic pressure feedback.
-Its integral term compensates leakage and deviations of dead band and flow gain from the nominal
-machine.
+Its integral term compensates leakage and deviations of dead band and flow gain from those of
+the machine without effects.
 """
 
 from collections.abc import Iterable
@@ -131,10 +131,10 @@ def compute_servo_commands(servo_parameters, grid, table, reference, rate_ahead,
 
     Args:
         servo_parameters: (k, 14) of `control.servo.servo_parameters`.
-        grid: (k, 2) of `control.servo.tabulate_drives`.
-        table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drives`.
+        grid: (k, 2) of `control.servo.tabulate_drive_geometry`.
+        table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drive_geometry`.
         reference: (n, k) [rad] or [m].
-        rate_ahead: (n, k) reference rates, advanced by the spool lag [rad/s] or [m/s].
+        rate_ahead: (n, k) reference rates, those of a time later by the lag of the valve spool [rad/s] or [m/s].
         measured: MeasuredState with (n, k) arrays, (n,) supply pressures.
         load: (n, k) low-pass filtered drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
@@ -172,7 +172,7 @@ def compute_tip_poses(arm, q, pose):
     Returns:
         Nothing.
 
-    Source: `kinematics.task.task_forward`.
+    Source: `kinematics.task.compute_tip_pose`.
     """
     for i in range(len(q)):
         compute_tip_pose(arm, q[i], pose[i])
@@ -191,7 +191,7 @@ def compute_joint_angles(arm, ranges, pose, q):
     Returns:
         Nothing.
 
-    Source: `kinematics.task.task_inverse`.
+    Source: `kinematics.task.solve_joint_angles`.
     """
     k = q.shape[1]
     found = np.empty(k)
@@ -210,7 +210,7 @@ class ValveServo:
     """Joint servo that returns valve (or force drive) actions for axis references."""
 
     def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
-        """Read the parameters of the controller from the nominal machine.
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects.
 
         Args:
             setup: the task with its options, with `valve` actions.
@@ -246,7 +246,7 @@ class ValveServo:
         Args:
             observation: (n, o).
             reference: (n, k) reference positions [rad] or [m].
-            rate_ahead: (n, k) reference rates, advanced by the spool lag [rad/s] or [m/s].
+            rate_ahead: (n, k) reference rates, those of a time later by the lag of the valve spool [rad/s] or [m/s].
 
         Returns:
             (n, k) actions.

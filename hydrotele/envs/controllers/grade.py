@@ -34,7 +34,7 @@ class PoseFollower:
     """Track a moving tip pose with an arm that has no further driven axes."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from the nominal machine."""
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_specification(setup.machine)
         self._dt, self._k = environment_step_time(setup), k
@@ -129,7 +129,7 @@ _MIN_RADII = np.array([3.0, 3.0, 3.0, 3.45, 3.86, 4.30, 5.10, 6.70]) + 0.05  # m
 
 
 class GradeController:
-    """Grade the ground in passes along the plane, each at most 0.15 m deep."""
+    """Controller that cuts the ground down to the target plane in passes of at most 0.15 m depth."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
@@ -170,7 +170,7 @@ class GradeController:
         return self._follower(seen, pose, np.insert(self._reference_rate, 1, 0.0, axis=1))
 
     def _update_phases(self, tip: np.ndarray, errors: np.ndarray, mass: np.ndarray, edge: np.ndarray):
-        """Switch finished episodes to their next phase, and choose the range of the next pass."""
+        """Switch every episode whose phase is finished to its next phase, and choose the radii of the next cut."""
         self._phase_time += self._dt
         phase, place = self._phase, self._reference
         waiting = np.sqrt(np.mean(errors**2, axis=1)) < _FLAT_ERROR
@@ -203,7 +203,7 @@ class GradeController:
         self._phase_time[done] = 0.0
 
     def _compute_phase_targets(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the targets (n, 3) of the phase: r [m], z [m], attitude [rad], and the maximum rates (n, 3)."""
+        """Return the tip targets (n, 3) of the phases, r [m], z [m], attitude [rad], and their rate limits (n, 3)."""
         phase, place = self._phase, self._reference
 
         def plane(r: np.ndarray) -> np.ndarray:
@@ -235,7 +235,10 @@ class GradeController:
         return goal, fast
 
     def _advance_reference(self, goal: np.ndarray, fast: np.ndarray, tip: np.ndarray) -> None:
-        """Advance the reference within the reach of the arm and its maximum lead over the tip."""
+        """Move the reference pose of the tip towards `goal` (n, 3) by one step, with rates up to `fast` (n, 3).
+
+        It stays within the reach of the arm and within a maximum distance from the measured `tip` (n, 3).
+        """
         wanted = np.clip(_POSITION_GAIN * (goal - self._reference), -fast, fast)
         drawn = (self._phase == DRAW) | (self._phase == LOWER)
         # during a cut, the height tracks the plane without lag

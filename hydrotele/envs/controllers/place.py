@@ -52,8 +52,8 @@ def trapezoidal_move_fraction(time: np.ndarray, length: np.ndarray, ramp: np.nda
         ramp: (n,) duration of the first and of the last ramp [s]; the move takes `length + ramp`.
 
     Returns:
-        (n,) from 0 to 1: the integral of a box of speed convolved with a box of width `ramp`, whose
-        spectrum is zero at the frequency 1 / `ramp`.
+        (n,) from 0 to 1. The ramps do not excite a vibration of period `ramp`, because the spectrum of the
+        speed is zero at the frequency 1 / `ramp`.
     """
 
     def travelled_distance(t):
@@ -79,7 +79,7 @@ class MovePlanner:
     """Plan the motion of the stick's pin, the grapple rotation and the jaw, phase by phase."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine and the observation columns."""
+        """Read rate limits and geometry from `setup.machine`, and find the observation columns that are used."""
         self._lateral_offset = float(arm_specification(setup.machine)[0][2])
         self._tip = find_pin_and_grapple_columns(setup)
         self._log = find_observation_columns(setup, "log", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
@@ -123,7 +123,7 @@ class MovePlanner:
         return self._move_start + share * (self._move_end - self._move_start)
 
     def _next_phases(self, seen: np.ndarray) -> np.ndarray:
-        """Return the phases (n,) that follow the current ones; a lost log leads to RELEASE."""
+        """Return the phases (n,) that follow the current ones: RELEASE if the log was lost, else the next in order."""
         following = (self._phase + 1) % (LEAVE + 1)
         lost = (seen[:, self._held] < 0.5) & np.isin(self._phase, (CLOSE, LIFT, SLEW))
         return np.where(lost, RELEASE, following)
@@ -155,7 +155,10 @@ class MovePlanner:
         return theta - np.arcsin(self._lateral_offset / r)
 
     def _plan_grip_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target (m, 5) of the open grapple above the log, aligned with it; `goes` is the last target."""
+        """Return the target (m, 5) of the open grapple above the log, aligned with it; `goes` is the last target.
+
+        The columns are those of `reference_ahead`.
+        """
         r, theta, sine, cosine = seen[:, self._log].T
         to = goes.copy()
         swing = self._swing_angle_of_pin(r, theta)
@@ -170,7 +173,10 @@ class MovePlanner:
         return to
 
     def _plan_lay_down_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target (m, 5) that brings the held log over its goal with the goal yaw."""
+        """Return the target (m, 5) that brings the held log over its goal with the goal yaw.
+
+        The columns are those of `reference_ahead`; height and jaw stay those of the last target `goes`.
+        """
         r, theta, sine, cosine = seen[:, self._log].T
         goal_r, goal_theta, goal_sine, goal_cosine = seen[:, self._goal].T
         now, to = seen[:, self._tip], goes.copy()
@@ -191,7 +197,7 @@ class PlaceByTip:
     """Track the planned moves by rates of the pin (`resolved_motion`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from the nominal machine."""
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
         self.planner, self._tip, self._dt = (
             MovePlanner(setup),
             find_pin_and_grapple_columns(setup),
@@ -225,7 +231,7 @@ class PlaceByAxes:
     """Track the planned moves by axis rates (`joint_rate`) or valve commands (`valve`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from the nominal machine."""
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
         self.planner, self._joint = MovePlanner(setup), find_position_columns(setup)
         (self._arm, _, self._ranges), self._dt = arm_specification(setup.machine), environment_step_time(setup)
         fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])

@@ -44,7 +44,8 @@ _DIFFERENCE_STEP = 0.02  # s, half width of the central difference quotient
 class ReferencePreview:
     """Interpolate the observed references in time by a polynomial.
 
-    The polynomial of fourth order matches the positions now and after the `PREVIEW_TIMES`, and the rate now.
+    The observation holds the references now and at some times ahead (`PREVIEW_TIMES`), and the rate now. The
+    polynomial passes through all of them.
     """
 
     def __init__(self, setup: TaskSetup) -> None:
@@ -67,7 +68,10 @@ class ReferencePreview:
 
 
 class TrackByValves:
-    """Track references by the joint servo with an integral term and a phase lead of the rates."""
+    """Track the axis references by valve commands of the joint servo, with an integral term.
+
+    The reference rates are taken from a time slightly ahead, which compensates the lag of the valves.
+    """
 
     def __init__(
         self,
@@ -76,13 +80,13 @@ class TrackByValves:
         integral: float = _INTEGRAL_GAIN,
         lead: float = _PHASE_LEAD,
     ) -> None:
-        """Read the parameters of the controller from the nominal machine.
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects.
 
         Args:
             setup: the task with its options.
             servo: gains of the joint servo.
             integral: gain of the integral term [1/s^2].
-            lead: phase lead of the reference rates [s].
+            lead: time ahead from which the reference rates are taken [s].
         """
         self._valve_servo, self._preview = (
             ValveServo(setup, servo, integral),
@@ -99,15 +103,15 @@ class TrackByValves:
 
 
 class RateFeedback:
-    """Compute rate commands for lower control loops, with a model of their references.
+    """Compute rate commands that make positions track references, with feedback of a modelled position.
 
-    Feedback of the measured position must be slow, since the lower loops are slow. The model
-    integrates the commanded rates without lag, so its position can be fed back with a high gain.
-    The model is corrected slowly towards the measured position.
+    Control loops of the environment track the commanded rates. They are slow, so the measured position
+    cannot be fed back with a high gain. The model integrates the commanded rates without lag, so its
+    position can. It is corrected slowly towards the measured position.
     """
 
     def __init__(self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains) -> None:
-        """Store clocks, limits and gains.
+        """Store control period, rate limits and gains.
 
         Args:
             setup: the task with its options.
@@ -161,7 +165,7 @@ class TrackByJointRates:
     """Track joint references by joint rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from the nominal machine."""
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
         self._preview, self._joint = ReferencePreview(setup), find_position_columns(setup)
         fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])
         self._rate_feedback = RateFeedback(setup, fastest, np.full(len(fastest), MAX_ACCELERATION), _JOINT_RATE_GAINS)
@@ -177,7 +181,7 @@ class TrackByResolvedMotion:
     """Track the tip pose that corresponds to the joint references by tip rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from the nominal machine.
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects.
 
         Raises:
             InputError: the task drives axes that do not belong to the arm.
@@ -224,7 +228,7 @@ class TipController:
     """Base of the controllers that track a tip pose with any kind of actions."""
 
     def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
-        """Read the parameters of the controller from the nominal machine.
+        """Read the parameters of the controller from `setup.machine`, the machine without added effects.
 
         Args:
             setup: the task with its options.
@@ -259,7 +263,7 @@ class TipController:
 
 
 class LineController(TipController):
-    """Track a line by the reference rate shortly ahead and the current error."""
+    """Track a line by the rate of the reference a short time ahead, plus feedback of the tracking error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
@@ -287,7 +291,7 @@ class LineController(TipController):
 
 
 class ReachController(TipController):
-    """Move to a pose with a rate proportional to the remaining error."""
+    """Move the tip to the goal pose at rates proportional to the remaining error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
@@ -332,7 +336,7 @@ _FORCE_GAIN = 2.0e-6  # m/s per N: a loop gain of 2 /s on 1e6 N/m
 
 
 class PressController:
-    """Set the vertical speed of the tip proportional to the force error."""
+    """Lower the tip to the plate; in contact, set its vertical speed proportional to the force error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses.
