@@ -581,7 +581,10 @@ def predict_held_out_place(
         known = (*place_names(sockets), *(s.name for s in sockets))
         raise InputError(f"--heldout {name}", f"is not a place of the data; {suggest_valid_name(name, known)}")
     if not rest:
-        raise InputError(f"--heldout {name}", "is the only place; record another one")
+        raise InputError(
+            f"--heldout {name}",
+            "holds all sockets, so that none is left to calibrate on; record sockets at another place, too",
+        )
     found = calibrate_sockets(robot, rest, options)
     problem = _SocketProblem(robot, rest, (), SocketOptions(distance=None))
     values = dict(zip(problem.names, _fit_nominal_ball(problem).tolist(), strict=True))

@@ -37,11 +37,8 @@ from hydrotele.teleop.analysis import (
     check_structures,
     load_teleop_case,
 )
-from hydrotele.teleop.findings import (
-    ScenarioFindings,
-    TeleopFindings,
-    analyse_scenario_case,
-    analyse_structures,
+from hydrotele.teleop.findings import ScenarioFindings, TeleopFindings, analyse_scenario_case, analyse_structures
+from hydrotele.teleop.findings_document import (
     describe_stability,
     findings_to_dict,
     format_delay,

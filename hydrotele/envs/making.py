@@ -72,7 +72,7 @@ _STRICT_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
 _OPTION_TYPES: dict[str, TypeAdapter] = {
     name: TypeAdapter(hint, config=_STRICT_CONFIG) for name, hint in get_type_hints(Options).items()
 }
-_COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import compile_openings; compile_openings()"
+_COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import precompile_loop_residuals as compile_; compile_()"
 AUTORESET_MODES = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 

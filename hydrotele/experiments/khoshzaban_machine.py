@@ -210,7 +210,7 @@ def evaluate_dh_parameters(samples: Sequence[Sample]) -> Evaluation:
     ),))  # fmt: skip
 
 
-def evaluate_force_errors(samples: Sequence[Sample]) -> Evaluation:
+def evaluate_drive_force_errors_of_pressure(samples: Sequence[Sample]) -> Evaluation:
     """Compare the torque and force errors due to pressure errors of 25 psi with Khoshzaban 1992, Eq. 4.61."""
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
@@ -365,7 +365,7 @@ EXPERIMENTS = (
               {"links.stick.position": (5.19, 0.0, 0.0)}, "the boom's length of Fig. 5"),
         Claim("error of torque and force from pressures within 25 psi",
               "about 1400 N m (swing), 5700 N (boom), 4200 N (stick)",
-              "section 4.4.3, p. 108", "input", evaluate_force_errors,
+              "section 4.4.3, p. 108", "input", evaluate_drive_force_errors_of_pressure,
               {"axes.boom.cylinder.area_head": 0.01}, "a smaller boom cylinder"),
     ), fixed_repetitions=1),
     Experiment("identifiable parameters", find_identifiable_parameters, (

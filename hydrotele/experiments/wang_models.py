@@ -295,7 +295,7 @@ def measure_proportionality(seed: int, changes: Changes) -> Sample:
     return Sample({**slopes, "dh at 1 mrad": float(curves["dh"][4])}, (panel,))
 
 
-def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_parameter_change_with_tilt(samples: Sequence[Sample]) -> Evaluation:
     exponents = {name: np.array([s.values[name] for s in samples]) for name in ("dh", "poe")}
     return Evaluation(
         (check_mean("exponent of the change of d (D-H) with the tilt", exponents["dh"],
@@ -426,7 +426,7 @@ PROPORTIONALITY = Experiment(
             "proportionality of D-H and POE models",
             'the D-H model "fails to be proportional when the two consecutive joint axes are'
             ' parallel or nearly parallel"; "the POE model can perfectly meet the proportionality'
-            ' properties"', "section 2.1 (p. 24)", "document", _evaluate_proportionality,
+            ' properties"', "section 2.1 (p. 24)", "document", _evaluate_parameter_change_with_tilt,
             {"parallel": False}, "the axes are perpendicular",
         ),
     ),

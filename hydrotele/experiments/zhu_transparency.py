@@ -33,7 +33,7 @@ from hydrotele.experiments.zhu_two_port import (
     make_identical_sides_case,
 )
 from hydrotele.teleop.analysis import TeleoperatorAxis, find_first_change, is_strictly_stable
-from hydrotele.teleop.findings import compare_stability
+from hydrotele.teleop.time_simulation import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
     TwoPort,

@@ -29,7 +29,7 @@ from hydrotele.experiments.scenario_runs import (
     run_shipped_scenario,
 )
 from hydrotele.teleop.analysis import TeleoperatorAxis, find_gain_margin, load_teleop_case
-from hydrotele.teleop.findings import compare_stability
+from hydrotele.teleop.time_simulation import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
     TwoPort,

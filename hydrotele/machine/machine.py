@@ -104,7 +104,7 @@ class SensorError(StrictModel):
         return self.offset + warming_drift(time, self.drift, self.drift_time_constant)
 
     @property
-    def has_coupling_error(self) -> bool:
+    def has_misalignment_or_backlash(self) -> bool:
         """Whether the coupling of the sensor has a misalignment or a backlash."""
         return self.tilt > 0.0 or self.backlash > 0.0
 
@@ -433,7 +433,7 @@ class Machine(StrictModel):
             _check_name_is_known(self.arm.tip.link, known, "arm.tip.link")
         for channel, error in self.sensor_errors.items():
             _check_name_is_known(channel, self.sensed_channels, "sensor_errors")
-            if error.has_coupling_error:
+            if error.has_misalignment_or_backlash:
                 places = [f"angle.{joint}" for joint in self.undriven_sensed_joints]
                 _check_name_is_known(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)

@@ -123,7 +123,7 @@ def run_planned_ticks(ticks, simulated, planned, row, contacts, first, last, sto
         simulated: record of the machine, from `simulate.stepping.simulation_record`.
         planned: record of plan and controller, from `control.tick.planned_run_record`.
         row: record of the log rows, from a `Recorder`.
-        contacts: record of contact forces, from `simulate.record.contact_record`.
+        contacts: record of contact forces, from `simulate.record.make_contact_addresses`.
         first: number of the first control tick, scalar.
         last: number of the control tick before which to stop, scalar.
         stopped: whether all commands are set to 0, scalar.
@@ -213,7 +213,8 @@ def update_max_pin_opening(ticks):
 
 def start_background_compilation() -> None:
     """Start to compile the tick loop of a teleoperated run in a separate process."""
-    compile_in_background(run_teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
+    name = compile_tick_loop.__name__
+    compile_in_background(run_teleoperated_ticks, f"from {__name__} import {name}; {name}()")
 
 
 def compile_tick_loop() -> None:
@@ -347,7 +348,7 @@ class Session:
             plant.model, data, self._stepper.steps, self.ticks_per_row, scenario.row_count, self._dt
         )
         self._records = (
-            self._ticks.record, self._stepper.record, self._planned, *self._recorder.native_records(data),
+            self._ticks.record, self._stepper.record, self._planned, *self._recorder.row_address_records(data),
             *(self.station.memory_records if self.station else ()),
         )  # fmt: skip
         self._begin = 0.0

@@ -15,9 +15,8 @@ import hydrotele
 from hydrotele.show import report_html
 from hydrotele.show.report_html import figure_to_png, open_report_figure
 from hydrotele.teleop.analysis import stability_map
-from hydrotele.teleop.findings import (
-    ScenarioFindings,
-    TeleopFindings,
+from hydrotele.teleop.findings import ScenarioFindings, TeleopFindings
+from hydrotele.teleop.findings_document import (
     describe_stability,
     format_delay,
     format_gain_margin,

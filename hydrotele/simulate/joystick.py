@@ -137,7 +137,7 @@ class SimulatedFlotor:
             self.record[name] = value
 
     @property
-    def max_heat(self) -> float:
+    def max_relative_temperature_rise(self) -> float:
         """Largest temperature rise of any coil so far, relative to that at the continuous current [1]."""
         return float(self.record["hottest"][0])
 

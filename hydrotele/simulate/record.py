@@ -186,7 +186,7 @@ def record_row(record, contacts, row, time):
 
     Args:
         record: record of a `Recorder`.
-        contacts: record of `contact_record`.
+        contacts: record of `make_contact_addresses`.
         row: index of the row, scalar.
         time: time of the row, scalar [s].
 
@@ -258,7 +258,7 @@ class Recorder:
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo has issued a warning.
         """
-        self.native_records(data)
+        self.row_address_records(data)
         if delayed_readings is not None:
             self.record_sensor_values(row, delayed_readings)
         if not record_row(self._row, self._contacts, row, time):
@@ -269,7 +269,7 @@ class Recorder:
         if self.late.shape[1]:
             self.late[row] = delayed_readings
 
-    def native_records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+    def row_address_records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Return the records for `record_row`: that of the recorder's arrays and that of the contacts.
 
         They are created anew if `data` differs from that of the last call.
@@ -297,7 +297,7 @@ class Recorder:
             "timestep": model.opt.timestep, "groups": len(self.group_names),
         }.items():  # fmt: skip
             self._row[name] = value
-        self._contacts = contact_record(model, data, self.geom_groups)
+        self._contacts = make_contact_addresses(model, data, self.geom_groups)
 
     def instability_error(self, row: int) -> SimulationFailed:
         """Create the exception for an unstable simulation; its message lists the states up to a row."""
@@ -364,7 +364,7 @@ def total_contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.n
         around: (nbody,) result of `mark_surrounding_bodies`.
     """
     total, around = np.zeros(3), _geom_flags(model, around)
-    sum_contact_forces(contact_record(model, data, around), total)
+    sum_contact_forces(make_contact_addresses(model, data, around), total)
     return total
 
 
@@ -373,10 +373,10 @@ CONTACTS_DTYPE = np.dtype(
     + [(name, np.int64) for name in ("size", "frame", "geom", "around")],
     align=True,
 )
-"""Record type of `contact_record`."""
+"""Record type of `make_contact_addresses`."""
 
 
-def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
+def make_contact_addresses(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
     """Create the record with the addresses of contacts and forces for `sum_contact_forces`.
 
     Args:
@@ -404,7 +404,7 @@ def sum_contact_forces(record, total):
     """Compute the sum of the contact forces of ground and objects on the machine, in compiled code.
 
     Args:
-        record: record of `contact_record`.
+        record: record of `make_contact_addresses`.
         total: (3,) written: the sum, world frame [N].
 
     Returns:

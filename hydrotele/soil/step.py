@@ -425,11 +425,11 @@ def _drop_soil(n, surface, loose, state, first, second, volume):
     lost = add_loose_soil(n, surface, loose, first, 0.5 * volume)
     lost += add_loose_soil(n, surface, loose, second, 0.5 * volume)
     state[LOST_VOLUME] += lost
-    _mark_sliding_cells(state, min(first, second), max(first, second), len(surface))
+    _widen_sliding_range(state, min(first, second), max(first, second), len(surface))
 
 
 @compile_without_allocation
-def _mark_sliding_cells(state, low, high, count):
+def _widen_sliding_range(state, low, high, count):
     """Add the cells `low` to `high` and their neighbours to the range in which soil may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
     if state[LAST_SLIDING_CELL] <= state[FIRST_SLIDING_CELL]:
@@ -603,7 +603,7 @@ def step_soil(n, surface, loose, state, edge, dt, out):
         out[MASS_R], out[MASS_Z] = centre_r, centre_z
     out[FORCE_R], out[FORCE_Z], out[MOMENT] = force_r, force_z, moment
     if wall > -2:
-        _mark_sliding_cells(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
+        _widen_sliding_range(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
     if state[LAST_SLIDING_CELL] > state[FIRST_SLIDING_CELL]:
         slid = False
         low, high = int(state[FIRST_SLIDING_CELL]), int(state[LAST_SLIDING_CELL])

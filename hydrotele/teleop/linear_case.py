@@ -320,7 +320,7 @@ class LinearCase:
         )
 
     @property
-    def has_force_control(self) -> bool:
+    def operator_controls_force(self) -> bool:
         """Whether the simulated operator controls a contact force instead of a position.
 
         This is the case if the scenario gives the operator a target force, unless the force reflection
@@ -338,7 +338,7 @@ class LinearCase:
 
         The spring of an operator who controls a force follows the handle after the reflex delay.
         """
-        if not self.has_force_control:
+        if not self.operator_controls_force:
             return self.hand_impedance(s)
         late = REFLEX_DELAY + 0.5 / DECISION_RATE + 0.5 * self.periods.control_period
         own = self.hand_impedance.stiffness / s * np.exp(-late * s)

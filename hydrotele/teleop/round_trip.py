@@ -70,7 +70,7 @@ def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
     return sent - np.maximum.accumulate(newest)
 
 
-def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
+def compute_ages_on_arrival(delays: np.ndarray) -> np.ndarray:
     """Return for every period the age of the arriving packet, if it is newer than the one in use.
 
     Args:
@@ -82,9 +82,9 @@ def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
         arrival, but not beyond the longest delay, it is the longest delay, as if packets had been sent
         before the first period.
 
-    >>> compute_arriving_ages(np.array([2, 0, 3, 1, 0])).tolist()
+    >>> compute_ages_on_arrival(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
-    >>> compute_arriving_ages(np.array([-1, -1, -1, 1, 1])).tolist()  # the packet of period 1 is lost
+    >>> compute_ages_on_arrival(np.array([-1, -1, -1, 1, 1])).tolist()  # the packet of period 1 is lost
     [1, -1, -1, -1, 1]
     """
     delays = np.asarray(delays)

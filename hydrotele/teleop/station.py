@@ -30,7 +30,7 @@ from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.simulate.layout import field_offsets
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import contact_record, mark_surrounding_geoms, sum_contact_forces
+from hydrotele.simulate.record import make_contact_addresses, mark_surrounding_geoms, sum_contact_forces
 from hydrotele.teleop.axis_table import DEADBAND, HANDLE_RANGE, flat_view
 from hydrotele.teleop.master import (
     TASK_DAMPING,
@@ -48,7 +48,7 @@ from hydrotele.teleop.round_trip import (
     STATION_DTYPE,
     TICKS_PER_CHECK,
     ChannelBuffers,
-    compute_arriving_ages,
+    compute_ages_on_arrival,
     delays_to_periods,
     load_packet_delays,
 )
@@ -221,7 +221,7 @@ class TeleoperationSystem:
             self._force_estimator.force if self._force_estimator and not self._uses_true_force else np.zeros(len(axes))
         )
         self._owners = plant.model, mark_surrounding_geoms(plant)  # keep the memory of addresses alive
-        self._contacts = contact_record(plant.model, data, self._owners[1])
+        self._contacts = make_contact_addresses(plant.model, data, self._owners[1])
         self.log = TeleoperationLog(scenario.tick_count, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
             pilot, joystick, self._master, self.log, scenario.tick_count, self._period, scenario.seed,
@@ -383,7 +383,7 @@ class TeleoperationSystem:
             "max_handle_displacement_m": float(handle[:, :3].max()),
             "max_handle_rotation_rad": float(handle[:, 3:].max()),
             "max_coil_current_A": float(np.abs(self.log.master("currents")).max()),
-            "max_coil_heat": self._flotor.max_heat,
+            "max_coil_heat": self._flotor.max_relative_temperature_rise,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
             "max_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
             "tripped": self.valves_closed,
@@ -513,7 +513,7 @@ def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> Cha
     rng = np.random.default_rng([scenario.seed, 404])
     lost = rng.random((scenario.tick_count, 2)) < channel.loss_probability
     lost[: round(channel.loss_start / period)] = False
-    age = np.stack([compute_arriving_ages(delays[:, side]) for side in range(2)], axis=1)
+    age = np.stack([compute_ages_on_arrival(delays[:, side]) for side in range(2)], axis=1)
     age[lost] = -1
     age = np.ascontiguousarray(age, np.int64)
     longest = np.maximum(delays.max(axis=0), 0)

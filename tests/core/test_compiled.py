@@ -1,5 +1,6 @@
 """Compiled functions: what those without counted references may do, their caches, what is said."""
 
+import importlib
 import os
 import re
 import shutil
@@ -237,15 +238,15 @@ def test_bar_shows_the_fraction():
 ELSEWHERE = """
 import numpy as np
 from hydrotele.core import compiled
-from hydrotele.simulate.closure import widest_pin
-code = "import numpy as np; from hydrotele.simulate.closure import widest_pin as f"
+from hydrotele.simulate.closure import max_pin_opening
+code = "import numpy as np; from hydrotele.simulate.closure import max_pin_opening as f"
 code += "; f(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))"
 for _ in range(2):
-    compiled.compile_in_background(widest_pin, code)
+    compiled.compile_in_background(max_pin_opening, code)
 for process in compiled._background_processes.values():
     assert process.wait() == 0
-widest_pin(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))
-print(len(compiled._background_processes), sum(widest_pin.stats.cache_hits.values()))
+max_pin_opening(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))
+print(len(compiled._background_processes), sum(max_pin_opening.stats.cache_hits.values()))
 """
 
 
@@ -257,13 +258,25 @@ def test_what_a_process_beside_has_compiled_is_loaded_and_is_not_compiled_again(
 
 @pytest.mark.nightly
 def test_a_teleoperated_run_finds_what_was_compiled_ahead(tmp_path):
-    """Its arguments are of the types that `compile_ticks` says: nothing is compiled again."""
+    """Its arguments are of the types that `compile_tick_loop` compiles: nothing is compiled again."""
     code = """
 from hydrotele.run import run
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-run.compile_ticks()
+run.compile_tick_loop()
 run_scenario(load_scenario("press_stiffness", {"duration": "0.2"}))
-print(len(run.teleoperated_ticks.signatures))
+print(len(run.run_teleoperated_ticks.signatures))
 """
     assert _run(ROOT, os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), code)[0] == ["1"]
+
+
+def test_code_for_other_processes_imports_what_exists():
+    """Such code is a string, and a failure of its process would go unnoticed."""
+    imports = [
+        (path, *found)
+        for path in sorted((ROOT / "hydrotele").rglob("*.py"))
+        for found in re.findall(r'"from (hydrotele[\w.]*) import (\w+)(?: as \w+)?; ', path.read_text())
+    ]
+    assert imports
+    missing = [one for one in imports if not hasattr(importlib.import_module(one[1]), one[2])]
+    assert not missing

@@ -214,7 +214,7 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     inside.visual.map.znear = world.visual.map.znear
     cab = world.worldbody.add_body(name="cab", mass=1.0, inertia=[1e9] * 3)
     cab.add_joint(name="swing", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
-    world.replace_simulated_joystick(inside, frame=cab.add_frame(pos=mount))
+    world.attach(inside, frame=cab.add_frame(pos=mount))
     world.option.timestep, world.option.gravity = flotor.model.opt.timestep, [0, 0, -9.81]
     model = world.compile()
     data = mujoco.MjData(model)

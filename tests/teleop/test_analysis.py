@@ -17,16 +17,15 @@ from hydrotele.teleop.analysis import (
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.findings import (
-    analyse_structures,
+from hydrotele.teleop.findings import analyse_structures
+from hydrotele.teleop.findings_document import describe_stability, findings_to_dict
+from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
+from hydrotele.teleop.time_simulation import (
     choose_time_step,
-    describe_stability,
-    findings_to_dict,
     is_growing,
     measure_sine_impedance,
     simulate_impulse_response,
 )
-from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Impedance,

@@ -126,7 +126,7 @@ def test_hot_coils_get_less_until_they_have_cooled():
         steps += 1
     expected = time_to_overheat(full, c.continuous_current, c.thermal_time)
     assert steps * flotor.period == pytest.approx(expected, abs=flotor.period)
-    assert flotor.current_limit == c.continuous_current and flotor.max_heat >= 1.0
+    assert flotor.current_limit == c.continuous_current and flotor.max_relative_temperature_rise >= 1.0
     steps = 0
     while flotor.current_limit < c.max_current:
         flotor.step(np.zeros(6), np.zeros(6))

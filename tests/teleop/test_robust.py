@@ -7,7 +7,6 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import TeleoperatorAxis, analyse_structure, load_teleop_case
-from hydrotele.teleop.findings import is_growing, simulate_impulse_response
 from hydrotele.teleop.robust import (
     ImpedanceRanges,
     case_impedance_ranges,
@@ -21,6 +20,7 @@ from hydrotele.teleop.robust import (
 )
 from hydrotele.teleop.sampled import PASSIVITY_STRUCTURE, constant_delay_ages
 from hydrotele.teleop.switching import StiffnessAxis
+from hydrotele.teleop.time_simulation import is_growing, simulate_impulse_response
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Impedance,

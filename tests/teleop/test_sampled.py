@@ -8,7 +8,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import find_gain_margin, load_teleop_case
-from hydrotele.teleop.round_trip import compute_arriving_ages, compute_packet_ages, load_packet_delays
+from hydrotele.teleop.round_trip import compute_ages_on_arrival, compute_packet_ages, load_packet_delays
 from hydrotele.teleop.sampled import (
     PASSIVITY_STRUCTURE,
     SAMPLED_STRUCTURES,
@@ -150,8 +150,8 @@ def test_jitter_is_noise_and_a_steady_line_is_none():
 def test_lost_and_overtaken_packets():
     delays = np.array([1, 1, -1, 0, 4, 0, 0])
     assert compute_packet_ages(delays).tolist() == [1, 1, 1, 0, 1, 0, 0]
-    assert compute_arriving_ages(delays).tolist() == [4, 1, 1, 0, -1, 0, 0]
-    assert set(compute_arriving_ages(np.full(9, 3)).tolist()) == {3}  # a steady line: one packet every period
+    assert compute_ages_on_arrival(delays).tolist() == [4, 1, 1, 0, -1, 0, 0]
+    assert set(compute_ages_on_arrival(np.full(9, 3)).tolist()) == {3}  # a steady line: one packet every period
 
 
 def test_shares_of_ages():

@@ -7,7 +7,12 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import TeleoperatorAxis
-from hydrotele.teleop.findings import compare_stability, is_growing, measure_sine_impedance, simulate_impulse_response
+from hydrotele.teleop.time_simulation import (
+    compare_stability,
+    is_growing,
+    measure_sine_impedance,
+    simulate_impulse_response,
+)
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Impedance,

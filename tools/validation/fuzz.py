@@ -529,8 +529,9 @@ def _cache(dice: random.Random, folder: Path) -> Case:
     program = sys.executable, "-c", f"{code}; import hydrotele.law"
     subprocess.run(program, check=True, cwd=folder, capture_output=True)
     files = [path for path in (folder / "hydrotele/compiled").rglob("*") if path.is_file()]
+    contents = {path: path.read_bytes() for path in files}
     for path in dice.sample(files, dice.randint(1, len(files))):
-        content = bytearray(path.read_bytes())
+        content = bytearray(contents[path])
         match dice.randrange(6):
             case 0:
                 path.write_bytes(content[: dice.randint(0, len(content))])
@@ -538,7 +539,7 @@ def _cache(dice: random.Random, folder: Path) -> Case:
                 content[dice.randrange(len(content))] ^= 1 << dice.randrange(8)
                 path.write_bytes(content)
             case 2:
-                path.write_bytes(dice.choice(files).read_bytes())
+                path.write_bytes(contents[dice.choice(files)])
             case 3:
                 path.unlink()
             case 4:
