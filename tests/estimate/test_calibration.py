@@ -28,7 +28,7 @@ def test_numbers_off_everywhere_are_recovered_within_their_intervals():
     )  # fmt: skip
     group = calibration(nominal, left_out)
     assert 10 <= group.size <= 20
-    drawn = np.clip(np.random.default_rng(4).normal(size=group.size), group.lower_bound, group.upper_bound)
+    drawn = np.clip(np.random.default_rng(4).normal(size=group.size), group.low, group.high)
     data, _ = machine_data(nominal, group.change(nominal, group.values(drawn)))
     evidence = Evidence(data, data.fit, 2, 2e-3)
     guess = Guess().plus(group, np.zeros(group.size))

@@ -51,7 +51,7 @@ def test_wrong_figures_of_a_data_sheet_are_found():
     before, after = numbers(sheet), numbers(found.machine)
     for key, told in found.numbers.items():
         scale, reach = after[key].parameter.prior_std, 1.96 * before[key].parameter.prior_std
-        wide = told.upper_bound - told.lower_bound
+        wide = told.high - told.low
         assert wide <= 2.0 * 1.96 * scale * (1.0 + 1e-6) and 1.96 * scale <= reach * (1.0 + 1e-6)
     assert after["area.piston.area_rod"].parameter.prior_std < 0.3 * (
         before["area.piston.area_rod"].parameter.prior_std

@@ -258,7 +258,7 @@ def parameters(results: list[dict]) -> list[str]:
         worst = {k: np.abs(v[:, i] - exact.value[i]).max() for k, v in spread.items()}
         lines.append(
             f"| {name} | {bare.value[i]:.0f} | {exact.value[i]:.0f} |"
-            f" {first['gravity'].value[i]:.0f} | +-{first['gravity'].interval[i]:.0f} |"
+            f" {first['gravity'].value[i]:.0f} | +-{first['gravity'].ci95_half_width[i]:.0f} |"
             f" {worst['gravity']:.0f} | {worst['plain']:.0f} |"
         )
     largest = np.abs(exact.value).max()

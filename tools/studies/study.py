@@ -52,6 +52,6 @@ def publish(text: str, title: str, asked: argparse.Namespace) -> None:
     for name, value in vars(asked).items():
         if isinstance(value, Path):
             words += [] if name in _ASIDE else [f"../shared/{value.name}"]
-        elif name not in _ASIDE:
+        elif name not in _ASIDE and value not in (None, ""):
             words += [f"--{name}", f"{value}"]
     asked.out.write_text(f"# {title}\n\n`{' '.join(words)}`\n\n{text}", encoding="utf-8")
