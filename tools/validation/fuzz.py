@@ -755,6 +755,8 @@ def main() -> None:
         seeds = range(args.seed, args.seed + args.count)
         for verdict in pool.map(judge, seeds, chunksize=10):
             kinds[verdict.kind] += 1
+            if kinds.total() % 500 == 0:
+                print(f"{kinds.total()} of {args.count} cases", file=sys.stderr, flush=True)
             if verdict.defect:
                 found[verdict.defect] += 1
                 words = " ".join(verdict.words.split())[-300:]
