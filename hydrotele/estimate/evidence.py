@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from hydrotele.estimate.filter import MEMORY
-from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.hypothesis import DomainError, Guess
 from hydrotele.estimate.levels import find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,
@@ -126,8 +126,8 @@ class Evidence:
         self._information = list[str](), np.zeros((0, 0))
 
     def close(self) -> None:
-        """End the workers."""
-        self._pool.shutdown()
+        """End the workers; what has not begun is dropped."""
+        self._pool.shutdown(cancel_futures=True)
 
     def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
         """Tracks with gains of their own and the levels that the machine states."""
@@ -140,8 +140,15 @@ class Evidence:
         With `same`, the base is nearly the same machine: its Jacobians are used again, which is
         enough on the way to a fit, not for comparing it. With `reopened`, unknown inputs that the
         base has no need of are tried again: a guess with fewer parts may need them.
+
+        A guess outside the model's domain has zero likelihood: the tracks of the base, an infinite loss.
         """
-        machine = guess.machine(self.data.machine)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            if not self.tracks:
+                raise
+            return Judged(guess, self.tracks, np.inf)
         if not self.lacking:
             tracks = self.track(machine)
         else:
@@ -156,7 +163,10 @@ class Evidence:
         What the base needs where it does not follow the readings at all may hide what a guess does.
         Unknown inputs that the given levels lack are tried, too.
         """
-        machine = guess.machine(self.data.machine)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            return Judged(guess, self.tracks, np.inf)
         tracks = self.map(
             lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
             self.tracks,
@@ -196,10 +206,15 @@ class Evidence:
 
         What another step than the evidence's own changes for the base is taken out, lest an effect
         be preferred because it makes up for the integrator. With `parallel` the workers take a run
-        each, which must not be asked for from within one.
+        each, which must not be asked for from within one. Outside the model's domain, and from where a
+        filter breaks down, all errors have the largest size that counts.
         """
-        step, machine = step or self.step, guess.machine(self.data.machine)
+        step = step or self.step
         tracks = self.tracks if tracks is None else tracks
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            return np.full(sum(track.whitened.size for track in tracks), _CLIP)
 
         def one(track: Track) -> np.ndarray:
             return self._errors(machine, track, step) + self._made_by(step, track)
@@ -235,7 +250,11 @@ class Evidence:
         """
         if step > MIDDLE and not self._is_smooth(step):
             step = MIDDLE
-        return fine_enough(guess.machine(self.data.machine), step)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            machine = self._base.machine(self.data.machine)
+        return fine_enough(machine, step)
 
     def map(self, function: Callable, items: Sequence) -> list:
         """Apply a function to items on the workers."""
@@ -245,14 +264,21 @@ class Evidence:
         self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None,
         first: int = 0,
     ) -> np.ndarray:  # fmt: skip
-        """(E, P - first) change of the errors per deviation, from the given one on."""
-        nudges = guess.nudges()
+        """(E, P - first) change of the errors per deviation, from the given one on.
+
+        Differences are taken to the other side where the first one is outside the model's domain; 0 where
+        both are.
+        """
+        nudges, machine = guess.nudges(), self.data.machine
 
         def column(index: int) -> np.ndarray:
-            moved = guess.deviation
-            nudge = nudges[index]
-            moved[index] += nudge
-            return (self.errors(guess.at(moved), step) - errors) / nudge
+            for nudge in (nudges[index], -nudges[index]):
+                moved = guess.deviation
+                moved[index] += nudge
+                there = guess.at(moved)
+                if np.array_equal(there.deviation, moved) and there.is_in_domain(machine):
+                    return (self.errors(there, step) - errors) / nudge
+            return np.zeros(len(errors))
 
         columns = range(first, len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
@@ -324,13 +350,14 @@ class Evidence:
         """(E, P) slopes of the base from differences along the directions of an information."""
         base, sizes, ways = self._base, *np.linalg.eigh(information)
         here = base.deviation
-        moves = (_MOVE / np.sqrt(sizes)) * ways
+        moves = (_MOVE / np.sqrt(np.maximum(sizes, 1.0))) * ways  # 1 of the prior; less is rounding
         for way in moves.T:  # to the side where bounds leave more room
             ahead, back = (base.at(here + s * way).deviation - here for s in (1.0, -1.0))
             way[:] = ahead if ahead @ ahead >= back @ back else back
 
         def change(way: np.ndarray) -> np.ndarray:
-            return self.errors(base.at(here + way), step) - errors
+            moved = base.at(here + way)
+            return self.errors(moved, step) - errors if moved.is_in_domain(self.data.machine) else np.zeros(len(errors))
 
         changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
         return (np.linalg.pinv(moves.T) @ np.array(changes)).T
@@ -431,7 +458,8 @@ def _blocks(track: Track, seconds: float) -> np.ndarray:
     """-2 log likelihood of stretches of a run; the last, shorter one joins the one before."""
     there = np.isfinite(track.whitened)
     width = np.where(there, track.gains.spread, 1.0)
-    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), 0.0).sum(axis=1)
+    lost = np.where(np.isinf(track.whitened), np.inf, 0.0)  # the filter broke down
+    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), lost).sum(axis=1)
     count = max(1, int(len(rows) * track.run.period / seconds))
     edges = np.linspace(0, len(rows), count + 1).astype(int)
     return np.add.reduceat(rows, edges[:-1])

@@ -591,9 +591,11 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         out: Crossing, written.
 
     Returns:
-        -2 log likelihood without its constant; infinite if the states broke down.
+        -2 log likelihood without its constant; infinite if the states broke down. From that row on,
+        whitened errors are infinite where there is a reading, and predictions are NaN.
 
-    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
+    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings, whose
+        updates have Joseph's form, see `update_covariance`.
     """
     command, known, reading, period = rows
     noise, drift, unknown = variances
@@ -611,7 +613,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         trail, rough = trail[:0], rough[:0]
     reached = np.zeros((full + 1, full))
     moved, work = np.zeros(size), np.zeros((full, full))
-    delta, pull = np.zeros(few), np.zeros(full)
+    delta, pull, joseph = np.zeros(few), np.zeros(full), np.zeros(full)
     place(model, sp, z)
     first = np.int64(0)  # numba compiles a function anew for a written number
     read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
@@ -650,13 +652,13 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                             pull[s] += covariance[k, s] * hc[k]
                 for s in range(full):
                     total += hc[s] * pull[s]
+                if not total > 0.0:
+                    _mark_unpredicted(reading, whitened, predicted, corrected, row)
+                    return math.inf
                 width[row, c] = math.sqrt(total)
                 for s in range(full):
                     gain[row, c, s] = pull[s] / total
-                for s in range(full):
-                    part = gain[row, c, s]
-                    for k in range(full):
-                        covariance[s, k] -= part * pull[k]
+                update_covariance(covariance, hc, pull, gain[row, c], noise[row, c], joseph)
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]
@@ -665,6 +667,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         for s in range(size):
             corrected[row, s] = z[s]
         if not math.isfinite(loss):
+            _mark_unpredicted(reading, whitened, predicted, corrected, row)
             return math.inf
         if row == count - 1:
             break
@@ -705,6 +708,48 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                 z[r] += columns[row, i, r] * z[begin + i]
             z[begin + i] *= decay
     return loss
+
+
+@compile_without_allocation
+def update_covariance(covariance, slope, pull, gain, noise, joseph):
+    """Update a covariance with one reading: `P = (I - K H) P (I - K H)' + K R K'`, kept symmetric.
+
+    Args:
+        covariance: (n, n) P before the reading; overwritten.
+        slope: (n,) H, slope of the reading in the state.
+        pull: (n,) P H'.
+        gain: (n,) K, gain of the reading.
+        noise: R, variance of the reading, scalar.
+        joseph: (n,) work space.
+
+    Returns:
+        Nothing.
+
+    Source: Joseph's form, Bucy and Joseph 1968, Filtering for Stochastic Processes: positive definite in
+        spite of rounding, where `P - K H P` loses all digits as the noise is far below the spread.
+    """
+    size = len(gain)
+    for s in range(size):
+        joseph[s] = -noise * gain[s]
+    for k in range(size):  # a reading depends on few states
+        if slope[k] != 0.0:
+            for s in range(size):
+                joseph[s] += slope[k] * (covariance[k, s] - gain[s] * pull[k])
+    for s in range(size):
+        for k in range(s + 1):
+            covariance[s, k] -= gain[s] * pull[k] + joseph[s] * gain[k]
+            covariance[k, s] = covariance[s, k]
+
+
+@compile_without_allocation
+def _mark_unpredicted(reading, whitened, predicted, corrected, first):
+    """Mark all rows from one on as not predicted, because the states broke down."""
+    for row in range(first, len(reading)):
+        for c in range(reading.shape[1]):
+            whitened[row, c] = math.nan if math.isnan(reading[row, c]) else math.inf
+            predicted[row, c] = math.nan
+        for s in range(corrected.shape[1]):
+            corrected[row, s] = math.nan
 
 
 @compile_without_allocation

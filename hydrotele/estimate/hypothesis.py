@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import lateral_directions, nonparallel_cylinder_axes, with_value
 from hydrotele.machine.machine import Machine
@@ -26,6 +27,13 @@ WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes
 _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
 _OPEN = ("force", "flow", "valve", "supply")  # laws of which no drawing and no data sheet tells all
 _FREEDOM = 4.0  # degrees of freedom of the t distribution of their effects' sizes
+
+
+class DomainError(InputError):
+    """A trial value is outside the domain of a model: the machine with this value is not valid.
+
+    A search assigns it zero likelihood.
+    """
 
 
 @dataclass(frozen=True)
@@ -47,11 +55,21 @@ class Hypothesis:
     change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
 
     def machine(self, nominal: Machine, deviation: np.ndarray) -> Machine:
-        """The machine that has it, at a deviation (p,)."""
+        """Return the machine that has it, at a deviation (p,).
+
+        Raises:
+            DomainError: the machine with these values is not valid.
+        """
         values = self.values(deviation)
-        if self.change:
-            return self.change(nominal, values)
-        return EFFECTS[self.name].apply(nominal, self.location, values)
+        try:
+            if self.change:
+                return self.change(nominal, values)
+            return EFFECTS[self.name].apply(nominal, self.location, values)
+        except DomainError:
+            raise
+        except (ValueError, ArithmeticError) as error:  # of the machine file's validation, or of an effect's formula
+            stated = ", ".join(f"{key} = {value:.6g}" for key, value in values.items())
+            raise DomainError(f"{self.name} at {self.location}", f"{stated} is not possible: {error}") from error
 
     @property
     def size(self) -> int:
@@ -221,8 +239,20 @@ class Guess:
         steps = [h.nudges(d, size) for h, d in self.parts]
         return np.concatenate(steps) if steps else np.zeros(0)
 
+    def is_in_domain(self, nominal: Machine) -> bool:
+        """Return whether the machine with all these effects is valid."""
+        try:
+            self.machine(nominal)
+        except DomainError:
+            return False
+        return True
+
     def machine(self, nominal: Machine) -> Machine:
-        """The machine that has all these effects."""
+        """Return the machine that has all these effects.
+
+        Raises:
+            DomainError: it is not valid.
+        """
         for hypothesis, deviation in self.parts:
             nominal = hypothesis.machine(nominal, deviation)
         return nominal

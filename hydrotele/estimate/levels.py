@@ -25,11 +25,17 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.filter import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.estimate.filter import (
+    Input,
+    decay,
+    input_columns,
+    input_sizes,
+    possible_inputs,
+    update_covariance,
+)
 from hydrotele.estimate.reduced_model import state_names
 from hydrotele.estimate.track import (
     DRIFT,
-    STARTLE,
     STEP,
     Levels,
     Track,
@@ -106,7 +112,7 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
     """
     rows, channels, size = run.slope.shape
     p, work = run.initial.copy(), np.zeros((size, size))
-    d, pull = np.zeros(size), np.zeros(size)
+    d, pull, joseph = np.zeros(size), np.zeros(size), np.zeros(size)
     loss = 0.0
     for row in range(rows):
         before[row] = d
@@ -134,10 +140,7 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
             for s in range(size):
                 gain[row, c, s] = pull[s] / total
                 d[s] += gain[row, c, s] * y
-            for s in range(size):
-                part = gain[row, c, s]
-                for k in range(size):
-                    p[s, k] -= part * pull[k]
+            update_covariance(p, h, pull, gain[row, c], noise[row, c], joseph)
         if row == rows - 1:
             break
         for s in range(size):
@@ -504,10 +507,8 @@ def _agree_on_jitter(tracks: Sequence[Track]) -> bool:
     levels = tracks[0].levels
     slope = information = np.zeros(len(levels.noise))
     for track in tracks:
-        names = list(track.names)
-        drift = state_drift(names, levels, track.run.period)
-        linear = linear_run(track, by_kind(names, STARTLE) ** 2)
-        found = smooth(linear, row_variances(levels, track.run), drift)
+        linear = linear_run(track, track.unknown_command_variances)
+        found = smooth(linear, row_variances(levels, track.run), track.process_variances)
         shares = levels.jitter**2 * squared_rates(track.run) / found.width**2
         slope = slope + np.nansum(shares * (found.whitened**2 - 1.0), axis=0)
         information = information + np.nansum(shares**2, axis=0)
@@ -625,12 +626,13 @@ def _most_likely(
 ) -> Levels:  # fmt: skip
     """Levels of the largest posterior probability in the linearised runs; jitter if asked for."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
+    scales = tracks[0].scales
     white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
     w = c + m
     end = w + len(white)
     rows = max(_ROWS // len(tracks), _ROWS // 8)
-    runs = [_part(track, names, rows, levels.jitter > 0.0) for track in tracks]
+    runs = [_part(track, rows, levels.jitter > 0.0) for track in tracks]
     weight = sum(len(t.run.command) for t in tracks) / sum(len(run[0].error) for run in runs)
     largest = input_sizes(machine, levels.inputs)
     first = len(names) - m
@@ -647,7 +649,7 @@ def _most_likely(
 
         def one(part: tuple) -> tuple[float, np.ndarray, np.ndarray, float]:
             run: RunData = part[1]
-            drift = state_drift(names, now, run.period)
+            drift = state_drift(names, now, run.period, scales)
             found = smooth(part[0], row_variances(now, run, part[2]), drift, rates=part[2])
             noise = now.noise**2 if run.readings_per_mean is None else now.noise**2 / run.readings_per_mean
             per_jitter = now.jitter**2 * found.jitter_slope
@@ -690,11 +692,11 @@ def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
     return [n for n in names if n.partition(".")[0] in WHITE or n in held]
 
 
-def _part(track: Track, names: list[str], rows: int, jittered: bool) -> tuple[LinearRun, RunData, np.ndarray | None]:
+def _part(track: Track, rows: int, jittered: bool) -> tuple[LinearRun, RunData, np.ndarray | None]:
     """The stretch of a run in which the commands change most: linearised, and its squared rates."""
     busy = find_exciting_segment(track.run, rows)
     rates = np.ascontiguousarray(squared_rates(track.run)[busy]) if jittered else None
-    linear = linear_run(track, by_kind(names, STARTLE) ** 2, busy)
+    linear = linear_run(track, track.unknown_command_variances, busy)
     return linear, track.run.select_rows(busy.start, busy.stop), rates
 
 
@@ -720,17 +722,15 @@ def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = No
 
 def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     """A track's linear run, and what its smoother says of it, states included."""
-    names = list(track.names)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
-    return run, smooth(run, row_variances(track.levels, track.run), drift, True)
+    run = linear_run(track, track.unknown_command_variances)
+    return run, smooth(run, row_variances(track.levels, track.run), track.process_variances, True)
 
 
 def undisturbed_loss(track: Track) -> float:
     """-2 log likelihood to expect of a track whose unknown inputs were nothing, noise as found."""
     names, m = list(track.names), len(track.levels.inputs)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
+    run = linear_run(track, track.unknown_command_variances)
+    drift = track.process_variances
     initial = run.initial.copy()
     first = len(names) - m
     drift[first:], initial[first:] = 0.0, 0.0
@@ -755,8 +755,8 @@ def input_excess(track: Track) -> float:
     if not track.levels.inputs:
         return 0.0
     names, m = list(track.names), len(track.levels.inputs)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
+    run = linear_run(track, track.unknown_command_variances)
+    drift = track.process_variances
     noise = row_variances(track.levels, track.run)
     loss = smooth(run, noise, drift).loss
     drift[len(names) - m :] = 0.0

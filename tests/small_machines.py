@@ -1,0 +1,64 @@
+"""Machines of other sizes than the shipped ones, for tests: dynamically similar copies of them.
+
+Lengths grow by a ratio, masses by its cube, pressures by the ratio itself, because weight over area does.
+Angles, commands, angular rates of the drives and time constants of the valves stay. The oil keeps its bulk
+modulus, so that a small machine is stiff.
+"""
+
+from typing import Any
+
+from hydrotele.machine.machine import Machine
+
+_LENGTH_POWER = {
+    "position": 1, "com": 1, "closed_length": 1, "stroke": 1, "smoothing_length": 1,
+    "stribeck_velocity": 1, "mass": 3, "inertia": 5,
+    "area_head": 2, "area_rod": 2, "dead_volume": 3, "displacement": 3, "leakage": 2,
+    "rated_flow": 3, "pump_flow": 3, "tank_leakage": 2, "makeup_gain": 2, "port_relief_gain": 2,
+    "rated_pressure_drop": 1, "compensated_drop": 1, "port_relief": 1, "smoothing": 1,
+    "relief_pressure": 1, "tank_pressure": 1,
+}  # fmt: skip
+"""Field of a machine -> power of the length ratio by which it is multiplied."""
+_CYLINDER_FRICTION = {"coulomb": 3, "stribeck_extra": 3, "viscous": 2, "stribeck_velocity": 1}
+_MOTOR_FRICTION = {"coulomb": 4, "stribeck_extra": 4, "viscous": 4, "stribeck_velocity": 0}
+
+
+def scale_machine(machine: Machine, ratio: float, sensors: bool = False) -> Machine:
+    """Return a dynamically similar machine.
+
+    Args:
+        machine: with valve drives.
+        ratio: of the lengths [1].
+        sensors: whether to keep the stated sensors, whose accuracies are not scaled.
+
+    Returns:
+        The machine, validated.
+    """
+    data = machine.model_dump()
+    if not sensors:
+        data["sensors"] = {}
+    scaled = {key: _scale(value, ratio) for key, value in data.items()}
+    for name, axis in scaled["axes"].items():
+        for kind, powers in (("cylinder", _CYLINDER_FRICTION), ("motor", _MOTOR_FRICTION)):
+            if axis.get(kind):
+                old = data["axes"][name][kind]["friction"]
+                axis[kind]["friction"] = {k: _times(v, ratio ** powers.get(k, 0)) for k, v in old.items()}
+    for name, link in scaled["links"].items():
+        joint = data["links"][name]["joint"]
+        if joint:
+            link["joint"] = {**joint, "damping": joint["damping"] * ratio**4}
+    return Machine.model_validate(scaled)
+
+
+def _scale(value: Any, ratio: float) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: _times(part, ratio ** _LENGTH_POWER[key]) if key in _LENGTH_POWER else _scale(part, ratio)
+        for key, part in value.items()
+    }
+
+
+def _times(value: Any, factor: float) -> Any:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value * factor
+    return tuple(v * factor for v in value) if isinstance(value, list | tuple) else value
