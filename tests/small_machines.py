@@ -45,7 +45,12 @@ def scale_machine(machine: Machine, ratio: float, sensors: bool = False) -> Mach
     for name, link in scaled["links"].items():
         joint = data["links"][name]["joint"]
         if joint:
-            link["joint"] = {**joint, "damping": joint["damping"] * ratio**4}
+            slides = joint["type"] == "slide"
+            power = 2 if slides else 4
+            link["joint"] = {**joint, "damping": joint["damping"] * ratio**power}
+            if slides:
+                link["joint"]["range"] = _times(joint["range"], ratio)
+                scaled["home"][joint["name"]] = data["home"].get(joint["name"], 0.0) * ratio
     return Machine.model_validate(scaled)
 
 

@@ -426,7 +426,7 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
     if not len(d):  # a guess of nothing, or of what is held
         return d
     weight = guess.prior_weight
-    root = np.linalg.cholesky(slopes.T @ slopes + np.diag(weight))
+    root = factor_information(slopes.T @ slopes + np.diag(weight))
     target = -solve_triangular(root, slopes.T @ errors + weight * d, lower=True)
     move = solve_triangular(root.T, target)
     low, high = (np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high"))
@@ -434,6 +434,34 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
         return move
     # a trace beyond the ends, so that `at` puts what ends there at its end exactly
     return lsq_linear(root.T, target, (low - _TRACE, high + _TRACE), method="bvls").x
+
+
+_LEAST_EIGENVALUE = 1.0e-12  # of an information scaled to a unit diagonal: below it is rounding
+
+
+def factor_information(information: np.ndarray) -> np.ndarray:
+    """Return the lower Cholesky factor (P, P) of a symmetric information (P, P), scaled so that it exists.
+
+    Its rows and columns are scaled to a unit diagonal, and rounding is kept from making it indefinite.
+    """
+    scale = np.sqrt(np.diag(information))
+    scaled = information / np.outer(scale, scale)
+    scaled = 0.5 * (scaled + scaled.T) + _LEAST_EIGENVALUE * np.eye(len(scale))
+    return scale[:, None] * np.linalg.cholesky(scaled)
+
+
+def invert_information(information: np.ndarray) -> np.ndarray:
+    """Return the covariance (P, P) of an information (P, P) that includes a unit prior of each deviation.
+
+    Its eigenvalues are at least 1, that of the prior; less is rounding. So no variance is negative, and none
+    exceeds that of the prior.
+
+    >>> import numpy as np
+    >>> bool(np.all(np.diag(invert_information(np.full((3, 3), 1e30) + np.eye(3))) > 0.0))
+    True
+    """
+    sizes, directions = np.linalg.eigh(0.5 * (information + information.T))
+    return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
 def occam_penalty(information: np.ndarray, last: int) -> float:
@@ -500,7 +528,7 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     else:
         slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
-    covariance = np.linalg.inv(information)
+    covariance = invert_information(information)
     noisy = np.maximum(np.diag(covariance), _sandwich(evidence, slopes, covariance))
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.errors import InputError
 from hydrotele.estimate.filter import (
     Input,
     decay,
@@ -347,6 +348,7 @@ _TOLD_JITTER = 0.3  # of its variance: standard deviation with which a channel t
 _ALIKE = 0.5  # of its variance, by which channels may differ beside that
 _ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
+_IMPOSSIBLE = 1.0e100  # -2 log likelihood of levels at which a linear filter breaks down
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
 _PARTS = (1.0, 0.5, 0.2)  # of the way to new levels, where teeth make the linear form doubtful
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
@@ -359,20 +361,58 @@ def rough_noise(data: Dataset) -> np.ndarray:
     """(c,) noise of one logged reading, from third differences of the runs [channel's unit].
 
     They take out what moves slowly against the rows; what moves faster makes it too large. Never
-    less than a converter's step over sqrt(12).
+    less than the resolution of the readings, see `reading_resolution`. Of a channel that is logged at a
+    lower rate than the rows, differences between its own readings count.
     """
-    found = np.zeros(len(data.channels))
-    for c, channel in enumerate(data.channels):
-        values = np.concatenate([
-            np.diff(run.reading[:, c],
-            n=3) * (1.0 if run.readings_per_mean is None else run.readings_per_mean[c] ** 0.5)
-            for run in data.fit
-        ])  # fmt: skip
+    found, resolution = np.zeros(len(data.channels)), reading_resolution(data)
+    for c in range(len(data.channels)):
+        columns = [run.reading[:, c] for run in data.fit]
+        counts = [1.0 if run.readings_per_mean is None else run.readings_per_mean[c] ** 0.5 for run in data.fit]
+
+        def differences(columns: list[np.ndarray], counts: list[float] = counts) -> np.ndarray:
+            parts = [np.diff(column, n=3) * count for column, count in zip(columns, counts, strict=True)]
+            return np.concatenate(parts)
+
+        values = differences(columns)
         values = values[np.isfinite(values)]
+        if not len(values):
+            values = differences([column[np.isfinite(column)] for column in columns])
         spread = 1.4826 * np.median(np.abs(values)) if len(values) else 0.0
         if spread == 0.0 and len(values):  # more than half of the readings repeat
             spread = float(np.std(values))
-        found[c] = max(spread / np.sqrt(20.0), _rounding(data, channel), 1e-12)
+        found[c] = max(spread / np.sqrt(20.0), resolution[c])
+    return found
+
+
+_MAX_BITS = 20  # of a converter: no logged reading resolves more of its range
+_SAME_READING = 1e-9  # of a channel's size: readings that differ by less are equal but for rounding
+_CHANNEL_SIZES = {"pressure_head": 1e6, "pressure_rod": 1e6, "pressure_supply": 1e6}  # Pa; else 1 rad or 1 m
+
+
+def reading_resolution(data: Dataset) -> np.ndarray:
+    """Return the smallest noise that readings can have: that of their rounding.
+
+    It is the step between logged values over sqrt(12). The step is the largest of: that of the stated
+    converter, the smallest difference between two different readings, and the channel's range (or its size
+    where it is constant) divided by 2^20.
+
+    Args:
+        data: the logs; its fit runs count.
+
+    Returns:
+        (c,) standard deviations [channel's unit], above 0.
+    """
+    found = np.zeros(len(data.channels))
+    for c, channel in enumerate(data.channels):
+        values = np.concatenate([run.reading[:, c] for run in data.fit])
+        values = np.unique(values[np.isfinite(values)])
+        size = float(np.max(np.abs(values), initial=0.0)) or _CHANNEL_SIZES.get(channel.partition(".")[0], 1.0)
+        span = float(np.ptp(values)) if len(values) else 0.0
+        steps = np.diff(values)
+        step = float(np.min(steps[steps > _SAME_READING * size], initial=np.inf))
+        finest = max(span or size, _SAME_READING * size) / 2.0**_MAX_BITS
+        step = finest if not np.isfinite(step) else max(step, finest)
+        found[c] = max(step / 12.0**0.5, _rounding(data, channel))
     return found
 
 
@@ -410,10 +450,9 @@ def noise_prior(data: Dataset) -> Prior:
     rough, stated = rough_noise(data), np.isfinite(data.noise)
     noise = np.where(stated, data.noise, rough)
     width = np.where(stated, _STATED, 2.0 * _STATED)
-    rounding = np.array([_rounding(data, channel) for channel in data.channels])
     quieter = np.where(stated, _QUIETER, _QUIETER_UNSTATED)
-    low = np.maximum(quieter * np.minimum(noise, rough), rounding)  # an encoder's error at rest
-    return Prior(noise, width, low, _NOISIER * rough)
+    low = np.maximum(quieter * np.minimum(noise, rough), reading_resolution(data))  # an encoder's error at rest
+    return Prior(noise, width, low, np.maximum(_NOISIER * rough, low))
 
 
 def find_levels(
@@ -435,21 +474,29 @@ def find_levels(
         reopened: whether inputs that `start` lacks are tried again.
 
     Returns:
-        Tracks of the fit runs with these levels, linearised.
+        Tracks of the fit runs with these levels, linearised. Where the filter of a machine like that of
+        `start` breaks down, its tracks have an infinite loss.
+
+    Raises:
+        CannotFollowError: without `start`, and the filter breaks down.
     """
     prior = noise_prior(data)
     if start:
         levels = start[0].levels
         levels = _reopened(levels, machine) if reopened else _possible(levels, machine)
         tracks = _crossed(data, machine, levels, start, each, step, same)
+        if not np.isfinite(_whole(tracks)):
+            return tracks
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
         held = [n for n in _white_states(machine, state_names(machine)) if n.startswith("position")]
         rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
         tracks = _crossed(data, machine, rough, (), each, step)
+        check_filter_follows(tracks, data.channels)
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
         tracks = _crossed(data, machine, levels, tracks, each, step)
+        check_filter_follows(tracks, data.channels)
     best = tracks
     for index in range(rounds):
         before, old = tracks, levels
@@ -465,6 +512,63 @@ def find_levels(
         if _whole(tracks) > _whole(before) - _SETTLED:
             break
     return best if start else with_jitter(data, machine, best, each, step)
+
+
+class CannotFollowError(InputError):
+    """The filter of a model cannot follow the readings: the states broke down, or errors far exceed their noise."""
+
+
+MAX_ERROR_RATIO = 10.0  # RMS one-step error over its predicted standard deviation, which includes the residual
+# inputs: 1 of a consistent filter, whatever the model lacks; 10 of one whose spreads mean nothing
+_LIKELY_REASONS = (
+    "Likely reasons: a wrong unit, sign or column of this channel or of a command; a home position or a linkage"
+    " that does not reach the first readings; areas, chamber volumes or masses that are off by a large factor;"
+    " a log rate that is too low for this drive."
+)
+
+
+def check_filter_follows(
+    tracks: Sequence[Track], channels: Sequence[str], max_ratio: float = np.inf
+) -> None:  # fmt: skip
+    """Check that a filter follows the readings.
+
+    Args:
+        tracks: of the runs.
+        channels: names of the c channels.
+        max_ratio: largest RMS of the whitened one-step errors of a channel [1].
+
+    Raises:
+        CannotFollowError: the states broke down, or the errors of a channel exceed `max_ratio`; the message
+            states the channel, the size of its errors and the likely reasons.
+    """
+    for track in tracks:
+        if text := describe_lost_track(track, channels, max_ratio):
+            raise CannotFollowError(f"run {track.run.name}", f"{text} {_LIKELY_REASONS}")
+
+
+def describe_lost_track(track: Track, channels: Sequence[str], max_ratio: float = MAX_ERROR_RATIO) -> str:
+    """Return how a filter fails to follow a run, in one sentence; empty if it follows.
+
+    Args:
+        track: of the run.
+        channels: names of the c channels.
+        max_ratio: largest RMS of the whitened one-step errors of a channel [1].
+    """
+    lost = np.isinf(track.whitened).any(axis=1)
+    until = int(np.argmax(lost)) if lost.any() else len(lost)
+    errors = np.clip(track.whitened[: max(until, 1)], -1e12, 1e12)  # 1e12: large, and its square is a number
+    count = np.maximum(np.isfinite(errors).sum(axis=0), 1)
+    ratio = np.sqrt(np.nansum(errors**2, axis=0) / count)
+    worst = int(np.argmax(ratio))
+    size = f"its one-step error is {ratio[worst]:.3g} times its noise"
+    if lost.any():
+        time = track.run.start + until * track.run.period
+        return (
+            f"the model cannot follow channel {channels[worst]}: {size} until {time:.3g} s, where its states diverge."
+        )
+    if ratio[worst] > max_ratio:
+        return f"the model cannot follow channel {channels[worst]}: {size}."
+    return ""
 
 
 def with_jitter(
@@ -656,7 +760,10 @@ def _most_likely(
             return found.loss, noise * found.noise_slope, drift * found.drift_slope, per_jitter
 
         total = 0.0
-        for value, per_noise, per_drift, per_jitter in each(one, runs):
+        found = list(each(one, runs))
+        if not all(np.isfinite(value) for value, *_ in found):
+            return _IMPOSSIBLE, slope
+        for value, per_noise, per_drift, per_jitter in found:
             total += value
             slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]

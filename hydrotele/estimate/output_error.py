@@ -35,7 +35,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.effects import Parameter, with_value
 from hydrotele.estimate.free_run import _run_from, _shown, following_levels
-from hydrotele.estimate.hypothesis import DomainError, Guess, Hypothesis
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import Levels, steps_per_row, track_run
 from hydrotele.kinematics.from_machine import joint_range_at_drive

@@ -408,9 +408,10 @@ def max_valve_drive_time_step(machine: Machine) -> float:
         machine: the machine.
 
     Returns:
-        Step [s]: 5 ms times a power of two, so that small parameter changes seldom change it; infinite
-        without valve drives. It is below `1.6 / omega` with the highest natural frequency omega [rad/s] of the
-        mass matrix at home and the stiffness of the oil at the end of each stroke where it is highest.
+        Step [s]: 5 ms times a negative power of two, so that small parameter changes seldom change it. It is
+        below `1.6 / omega` with the highest natural frequency omega [rad/s] of the mass matrix at home and the
+        stiffness of the oil at the end of each stroke where it is highest. Infinite where 5 ms, the largest
+        step of the filter, is short enough, and without valve drives.
 
     Source: stability limit of Verlet's method, h < 2 / omega, with a margin of 20 % for other poses.
     """
@@ -433,7 +434,8 @@ def max_valve_drive_time_step(machine: Machine) -> float:
     if not np.isfinite(whitened).all():  # an impossible mass matrix, at which the filter stops
         return math.inf
     omega = math.sqrt(max(float(np.linalg.eigvalsh(whitened)[-1]), _SLOWEST_RAD_S**2))
-    return _TANGENT * 2.0 ** math.floor(math.log2(_MAX_PHASE_RAD / omega / _TANGENT))
+    longest = _MAX_PHASE_RAD / omega
+    return math.inf if longest >= _TANGENT else _TANGENT * 2.0 ** math.floor(math.log2(longest / _TANGENT))
 
 
 def _oil_stiffness(machine: Machine, axis: str) -> float:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.hypothesis import (
     CALIBRATION,
     Guess,
@@ -502,7 +502,7 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
         assert grown.fit
         first = sum(h.size for h in grown.now.guess.hypotheses[:index])
         own = slice(first, first + hypothesis.size)
-        covariance = np.linalg.inv(grown.fit.information)[own, own]
+        covariance = invert_information(grown.fit.information)[own, own]
         apart = np.diff(np.eye(hypothesis.size), axis=0)  # of the numbers, one from the next
         gone = apart @ deviation
         if gone @ np.linalg.solve(apart @ covariance @ apart.T, gone) > TOLD * len(gone):
