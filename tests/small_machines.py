@@ -7,6 +7,13 @@ modulus, so that a small machine is stiff.
 
 from typing import Any
 
+import numpy as np
+
+from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
+from hydrotele.estimate.track import steps_per_row
+from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 
 _LENGTH_POWER = {
@@ -67,3 +74,46 @@ def _times(value: Any, factor: float) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value * factor
     return tuple(v * factor for v in value) if isinstance(value, list | tuple) else value
+
+
+def simulate_data(
+    truth: Machine, channels: tuple[str, ...], noise: dict[str, float], model: Machine | None = None,
+    period: float = 0.02, rows: int = 400, noise_stated: bool = False,
+) -> Dataset:  # fmt: skip
+    """Simulate two runs of a machine with the reduced model, and return them as a dataset.
+
+    Args:
+        truth: machine that is simulated.
+        channels: c channels that are read.
+        noise: kind of channel -> standard deviation of its readings [channel's unit].
+        model: machine of the dataset; `truth` by default.
+        period: of the rows [s].
+        rows: of each run.
+        noise_stated: whether the dataset states the noise.
+
+    Returns:
+        The dataset; the first run is held out.
+    """
+    axes, names = tuple(actuator_order(truth)), state_names(truth)
+    assert truth.supply
+    sizes = np.array([noise[c.partition(".")[0]] for c in channels])
+    time, runs = period * np.arange(rows), []
+    for seed in range(2):
+        command = np.column_stack(
+            [0.4 * np.sin((1.1 + 0.4 * k + 0.13 * seed) * time / (50.0 * period) + k) for k in range(len(axes))]
+        )
+        state = np.zeros(len(names))
+        for s, name in enumerate(names):
+            kind, _, place = name.partition(".")
+            if kind == "position":
+                state[s] = truth.home.get(place, 0.0)
+            elif kind.startswith("pressure"):
+                state[s] = 0.3 * truth.supply.relief_pressure
+        simulated, steps = reduced_model(truth, channels), steps_per_row(truth, period, 0.5e-3)
+        shown, states = np.empty((rows, len(channels))), np.empty((rows, len(names)))
+        simulate_rows(simulated, model_space(simulated), state, command, period, steps, shown, states)
+        shown += np.random.default_rng(seed).normal(size=shown.shape) * sizes
+        log = Log(time=time, columns={}, units={})
+        runs.append(RunData(f"run_{seed}", 0.0, period, command, np.ones(rows, bool), shown, log))
+    stated = sizes if noise_stated else np.full(len(channels), np.nan)
+    return Dataset(model or truth, axes, channels, stated, tuple(runs[1:]), runs[0], ())

@@ -725,7 +725,7 @@ def _find_input_error(error: BaseException) -> InputError | None:
     if isinstance(error, InputError):
         return error
     effects = sys.modules.get("hydrotele.effects")
-    if own := effects and effects.describe_user_error(error):
+    if own := effects and effects.locate_error_in_effect_file(error):
         return own
     if isinstance(error, OSError):  # for example a file name that is too long
         return InputError(error.filename or "the system", error.strerror or str(error))

@@ -114,11 +114,14 @@ class Evidence:
     ):  # fmt: skip
         """Take the runs to judge by and the largest step [s]; `close` ends the workers.
 
+        A search calls `keep` with every guess that it accepts.
+
         With `lacking`, or where a channel's accuracy is not stated, noise levels are found from
         the data for every base (`estimate.levels`); otherwise they are those that are stated.
         """
         self.step, self.lacking = step, lacking or not known_levels(data)
         self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
+        self.keep: Callable[[Judged], None] = lambda judged: None
         self._pool = ThreadPoolExecutor(_threads(jobs, len(self.runs)))
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()

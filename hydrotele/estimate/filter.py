@@ -644,21 +644,11 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
             for s in range(few):
                 error -= hc[s] * delta[s]
             if fresh:
-                total = noise[row, c]
-                pull[:] = 0.0
-                for k in range(full):  # a reading depends on few states
-                    if hc[k] != 0.0:
-                        for s in range(full):
-                            pull[s] += covariance[k, s] * hc[k]
-                for s in range(full):
-                    total += hc[s] * pull[s]
+                total = update_covariance(covariance, hc, noise[row, c], pull, gain[row, c], joseph)
                 if not total > 0.0:
                     _mark_unpredicted(reading, whitened, predicted, corrected, row)
                     return math.inf
                 width[row, c] = math.sqrt(total)
-                for s in range(full):
-                    gain[row, c, s] = pull[s] / total
-                update_covariance(covariance, hc, pull, gain[row, c], noise[row, c], joseph)
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]
@@ -710,28 +700,42 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
     return loss
 
 
+_ROUNDING = 1.0e-13  # of a prediction's variance: less noise is lost in the rounding of its covariance
+
+
 @compile_without_allocation
-def update_covariance(covariance, slope, pull, gain, noise, joseph):
+def update_covariance(covariance, slope, noise, pull, gain, joseph):
     """Update a covariance with one reading: `P = (I - K H) P (I - K H)' + K R K'`, kept symmetric.
 
     Args:
         covariance: (n, n) P before the reading; overwritten.
         slope: (n,) H, slope of the reading in the state.
-        pull: (n,) P H'.
-        gain: (n,) K, gain of the reading.
-        noise: R, variance of the reading, scalar.
+        noise: R, variance of the reading, scalar; counts as at least 1e-13 of H P H'.
+        pull: (n,) P H', written.
+        gain: (n,) K, gain of the reading, written.
         joseph: (n,) work space.
 
     Returns:
-        Nothing.
+        `H P H' + R`, variance of the prediction error, scalar; not positive if P is not finite.
 
     Source: Joseph's form, Bucy and Joseph 1968, Filtering for Stochastic Processes: positive definite in
         spite of rounding, where `P - K H P` loses all digits as the noise is far below the spread.
     """
-    size = len(gain)
+    size, spread = len(gain), 0.0
     for s in range(size):
-        joseph[s] = -noise * gain[s]
+        pull[s] = 0.0
     for k in range(size):  # a reading depends on few states
+        if slope[k] != 0.0:
+            for s in range(size):
+                pull[s] += covariance[k, s] * slope[k]
+    for s in range(size):
+        spread += slope[s] * pull[s]
+    noise = max(noise, _ROUNDING * spread)
+    total = noise + spread
+    for s in range(size):
+        gain[s] = pull[s] / total
+        joseph[s] = -noise * gain[s]
+    for k in range(size):
         if slope[k] != 0.0:
             for s in range(size):
                 joseph[s] += slope[k] * (covariance[k, s] - gain[s] * pull[k])
@@ -739,6 +743,7 @@ def update_covariance(covariance, slope, pull, gain, noise, joseph):
         for k in range(s + 1):
             covariance[s, k] -= gain[s] * pull[k] + joseph[s] * gain[k]
             covariance[k, s] = covariance[s, k]
+    return total
 
 
 @compile_without_allocation

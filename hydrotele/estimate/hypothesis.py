@@ -126,6 +126,16 @@ class Hypothesis:
             for k in range(max(map(len, tables)))
         ]  # fmt: skip
 
+    def starts_in_domain(self, nominal: Machine) -> list[np.ndarray]:
+        """Return the starts (p,), each moved towards nominal until the machine is valid; nominal if none can be."""
+        found = []
+        for start in self.starts:
+            for part in (1.0, 0.5, 0.25, 0.125):
+                if Guess(((self, part * start),)).is_in_domain(nominal):
+                    found.append(part * start)
+                    break
+        return found or [np.zeros(self.size)]
+
     @property
     def key(self) -> tuple[str, str]:
         """Name and location."""
@@ -173,6 +183,72 @@ def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
             if parameters:
                 found.append(Hypothesis(effect.name, location, parameters))
     return found
+
+
+_BISECTIONS = 20  # of the way from nominal to a bound: its end is found to a millionth
+_LOOKS = (0.3, 0.03, 0.003)  # typical deviations from nominal that a hypothesis must allow at least one of
+
+
+def limit_to_domain(candidates: Sequence[Hypothesis], machine: Machine) -> tuple[list[Hypothesis], list[DomainError]]:
+    """Restrict the bounds of hypotheses to values for which the machine is valid.
+
+    Each parameter is taken from nominal to its bound alone, the others nominal. Values that are invalid only
+    in combination are left to the search, where they have zero likelihood.
+
+    Args:
+        candidates: the hypotheses.
+        machine: the given machine.
+
+    Returns:
+        The hypotheses that some value allows, with their bounds, and the errors of those that none does.
+    """
+    kept, errors = [], []
+    for hypothesis in candidates:
+        fault = find_domain_error(hypothesis, machine)
+        if fault is not None:
+            errors.append(fault)
+            continue
+        parameters = {}
+        for index, (key, p) in enumerate(hypothesis.parameters.items()):
+            low, high = hypothesis.low[index], hypothesis.high[index]
+            inside = [_reach(hypothesis, machine, index, end) for end in (low, high)]
+            changed = {}
+            for name, end, reach in (("lower_bound", low, inside[0]), ("upper_bound", high, inside[1])):
+                if reach != end:
+                    changed[name] = p.nominal + reach * p.prior_std
+            parameters[key] = replace(p, **changed) if changed else p
+        kept.append(replace(hypothesis, parameters=parameters))
+    return kept, errors
+
+
+def find_domain_error(hypothesis: Hypothesis, machine: Machine) -> DomainError | None:
+    """Return why no value near nominal is possible; None if one of its starts or a small change is."""
+    fault = None
+    small = [sign * size * np.ones(hypothesis.size) for size in _LOOKS for sign in (1.0, -1.0)]
+    for deviation in (*(s for s in hypothesis.starts if np.any(s)), *small):
+        try:
+            hypothesis.machine(machine, np.clip(deviation, hypothesis.low, hypothesis.high))
+            return None
+        except DomainError as error:
+            fault = error
+    return fault
+
+
+def _reach(hypothesis: Hypothesis, machine: Machine, index: int, end: float) -> float:
+    """Return the deviation of a parameter farthest from nominal towards an end that is possible."""
+
+    def is_possible(size: float) -> bool:
+        deviation = np.zeros(hypothesis.size)
+        deviation[index] = size
+        return Guess(((hypothesis, deviation),)).is_in_domain(machine)
+
+    if is_possible(end) or not is_possible(0.0):
+        return end
+    inside, outside = 0.0, end
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if is_possible(middle) else (inside, middle)
+    return inside
 
 
 def with_shape(hypothesis: Hypothesis, machine: Machine) -> Hypothesis | None:

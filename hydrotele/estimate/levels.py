@@ -126,22 +126,14 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
                 width[row, c] = np.nan
                 continue
             h = run.slope[row, c]
-            total = noise[row, c]
-            pull[:] = 0.0
-            for k in range(size):  # a reading depends on few states
-                if h[k] != 0.0:
-                    y -= h[k] * d[k]
-                    for s in range(size):
-                        pull[s] += p[k, s] * h[k]
-            for s in range(size):
-                total += h[s] * pull[s]
+            for k in range(size):
+                y -= h[k] * d[k]
+            total = update_covariance(p, h, noise[row, c], pull, gain[row, c], joseph)
             width[row, c] = np.sqrt(total)
             whitened[row, c] = y / width[row, c]
             loss += y * y / total + np.log(total)
             for s in range(size):
-                gain[row, c, s] = pull[s] / total
                 d[s] += gain[row, c, s] * y
-            update_covariance(p, h, pull, gain[row, c], noise[row, c], joseph)
         if row == rows - 1:
             break
         for s in range(size):

@@ -27,7 +27,7 @@ from hydrotele.estimate.hypothesis import (
     numbers,
     with_shape,
 )
-from hydrotele.estimate.levels import input_excess, noise_prior
+from hydrotele.estimate.levels import MAX_ERROR_RATIO, check_filter_follows, input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (
     FIT_STEPS,
@@ -269,6 +269,8 @@ def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progr
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
+    check_filter_follows(base.tracks, evidence.data.channels, MAX_ERROR_RATIO)
+    evidence.keep(base)
     candidates = timed(candidates, base)
     grown = _begun(evidence, base, candidates, tell)
     jittered = evidence.with_jitter(grown.now)
@@ -287,6 +289,7 @@ def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progr
         grown = _sparse(evidence, base, grown, candidates, tell)
     grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
     grown = _given_back(evidence, grown)
+    evidence.keep(grown.now)
     return _compared(evidence, base, grown, tell)
 
 
@@ -427,6 +430,7 @@ def _grow(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked, ahead = grown, settled, None, None
+        evidence.keep(now)
     return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak, toothed=toothed)
 
 
