@@ -126,16 +126,6 @@ class Hypothesis:
             for k in range(max(map(len, tables)))
         ]  # fmt: skip
 
-    def starts_in_domain(self, nominal: Machine) -> list[np.ndarray]:
-        """Return the starts (p,), each moved towards nominal until the machine is valid; nominal if none can be."""
-        found = []
-        for start in self.starts:
-            for part in (1.0, 0.5, 0.25, 0.125):
-                if Guess(((self, part * start),)).is_in_domain(nominal):
-                    found.append(part * start)
-                    break
-        return found or [np.zeros(self.size)]
-
     @property
     def key(self) -> tuple[str, str]:
         """Name and location."""
@@ -190,7 +180,7 @@ _LOOKS = (0.3, 0.03, 0.003)  # typical deviations from nominal that a hypothesis
 
 
 def limit_to_domain(candidates: Sequence[Hypothesis], machine: Machine) -> tuple[list[Hypothesis], list[DomainError]]:
-    """Restrict the bounds of hypotheses to values for which the machine is valid.
+    """Restrict the bounds of hypotheses to values for which the machine is valid, and their start values.
 
     Each parameter is taken from nominal to its bound alone, the others nominal. Values that are invalid only
     in combination are left to the search, where they have zero likelihood.
@@ -216,9 +206,18 @@ def limit_to_domain(candidates: Sequence[Hypothesis], machine: Machine) -> tuple
             for name, end, reach in (("lower_bound", low, inside[0]), ("upper_bound", high, inside[1])):
                 if reach != end:
                     changed[name] = p.nominal + reach * p.prior_std
-            parameters[key] = replace(p, **changed) if changed else p
+            if changed:
+                p = replace(p, **changed)
+                p = replace(p, start_values=tuple(_start_inside(p, start) for start in p.start_values))
+            parameters[key] = p
         kept.append(replace(hypothesis, parameters=parameters))
     return kept, errors
+
+
+def _start_inside(p: Parameter, start: float) -> float:
+    """Return a start value, or half the way from nominal to the bound that it exceeds."""
+    inside = float(np.clip(start, p.lower_bound, p.upper_bound))
+    return start if inside == start else 0.5 * (p.nominal + inside)
 
 
 def find_domain_error(hypothesis: Hypothesis, machine: Machine) -> DomainError | None:

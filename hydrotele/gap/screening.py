@@ -124,7 +124,7 @@ def _rank(
             return errors_of(guess.plus(hypothesis, d), step) - ground.errors
 
         rated = []
-        for start in hypothesis.starts_in_domain(evidence.data.machine):
+        for start in hypothesis.starts:
             if np.any(start) and hypothesis.size > 1:
                 rated.append(_point(hypothesis, ground, start, shift_to(start)))
             elif np.any(start):

@@ -161,7 +161,7 @@ def test_bounds_and_starts_are_moved_into_the_domain(small):
     (effect,), errors = limit_to_domain([limited(0.12)], machine)
     assert not errors
     assert effect.parameters["deadband"].upper_bound == pytest.approx(0.12, abs=1e-4)
-    assert limited(0.12).starts_in_domain(machine)[0] == pytest.approx(np.zeros(1))  # an eighth of 2 is too far
+    assert effect.parameters["deadband"].start_values == pytest.approx((0.08,), abs=1e-4)  # half the way
     kept, (error,) = limit_to_domain([limited(-1.0)], machine)
     assert kept == [] and "no more travel" in str(error)
 
