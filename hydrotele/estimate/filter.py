@@ -594,8 +594,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         -2 log likelihood without its constant; infinite if the states broke down. From that row on,
         whitened errors are infinite where there is a reading, and predictions are NaN.
 
-    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings, whose
-        updates have Joseph's form, see `update_covariance`.
+    Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
     command, known, reading, period = rows
     noise, drift, unknown = variances
@@ -613,7 +612,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         trail, rough = trail[:0], rough[:0]
     reached = np.zeros((full + 1, full))
     moved, work = np.zeros(size), np.zeros((full, full))
-    delta, pull, joseph = np.zeros(few), np.zeros(full), np.zeros(full)
+    delta, pull = np.zeros(few), np.zeros(full)
     place(model, sp, z)
     first = np.int64(0)  # numba compiles a function anew for a written number
     read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
@@ -644,7 +643,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
             for s in range(few):
                 error -= hc[s] * delta[s]
             if fresh:
-                total = update_covariance(covariance, hc, noise[row, c], pull, gain[row, c], joseph)
+                total = update_covariance(covariance, hc, noise[row, c], pull, gain[row, c])
                 if not total > 0.0:
                     _mark_unpredicted(reading, whitened, predicted, corrected, row)
                     return math.inf
@@ -704,22 +703,21 @@ _ROUNDING = 1.0e-13  # of a prediction's variance: less noise is lost in the rou
 
 
 @compile_without_allocation
-def update_covariance(covariance, slope, noise, pull, gain, joseph):
-    """Update a covariance with one reading: `P = (I - K H) P (I - K H)' + K R K'`, kept symmetric.
+def update_covariance(covariance, slope, noise, pull, gain):
+    """Update a covariance with one reading: `P - K H P`, symmetric and positive definite in spite of rounding.
 
     Args:
         covariance: (n, n) P before the reading; overwritten.
         slope: (n,) H, slope of the reading in the state.
-        noise: R, variance of the reading, scalar; counts as at least 1e-13 of H P H'.
+        noise: R, variance of the reading, scalar; counts as at least 1e-13 of H P H'. What it then leaves of
+            the variance, R H P H' / (R + H P H'), exceeds the rounding of the difference.
         pull: (n,) P H', written.
         gain: (n,) K, gain of the reading, written.
-        joseph: (n,) work space.
 
     Returns:
         `H P H' + R`, variance of the prediction error, scalar; not positive if P is not finite.
 
-    Source: Joseph's form, Bucy and Joseph 1968, Filtering for Stochastic Processes: positive definite in
-        spite of rounding, where `P - K H P` loses all digits as the noise is far below the spread.
+    Source: Anderson and Moore 1979, Optimal Filtering, chapter 6.
     """
     size, spread = len(gain), 0.0
     for s in range(size):
@@ -730,19 +728,13 @@ def update_covariance(covariance, slope, noise, pull, gain, joseph):
                 pull[s] += covariance[k, s] * slope[k]
     for s in range(size):
         spread += slope[s] * pull[s]
-    noise = max(noise, _ROUNDING * spread)
-    total = noise + spread
+    total = max(noise, _ROUNDING * spread) + spread
     for s in range(size):
         gain[s] = pull[s] / total
-        joseph[s] = -noise * gain[s]
-    for k in range(size):
-        if slope[k] != 0.0:
-            for s in range(size):
-                joseph[s] += slope[k] * (covariance[k, s] - gain[s] * pull[k])
-    for s in range(size):
-        for k in range(s + 1):
-            covariance[s, k] -= gain[s] * pull[k] + joseph[s] * gain[k]
+        for k in range(s):
+            covariance[s, k] -= gain[s] * pull[k]
             covariance[k, s] = covariance[s, k]
+        covariance[s, s] -= gain[s] * pull[s]
     return total
 
 

@@ -113,7 +113,7 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
     """
     rows, channels, size = run.slope.shape
     p, work = run.initial.copy(), np.zeros((size, size))
-    d, pull, joseph = np.zeros(size), np.zeros(size), np.zeros(size)
+    d, pull = np.zeros(size), np.zeros(size)
     loss = 0.0
     for row in range(rows):
         before[row] = d
@@ -128,7 +128,7 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
             h = run.slope[row, c]
             for k in range(size):
                 y -= h[k] * d[k]
-            total = update_covariance(p, h, noise[row, c], pull, gain[row, c], joseph)
+            total = update_covariance(p, h, noise[row, c], pull, gain[row, c])
             width[row, c] = np.sqrt(total)
             whitened[row, c] = y / width[row, c]
             loss += y * y / total + np.log(total)

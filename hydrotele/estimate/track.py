@@ -461,8 +461,12 @@ def steps_per_row(machine: Machine, period: float, step: float) -> int:
     Returns:
         Their number, at least 1.
     """
-    least = math.ceil(period / fine_enough(machine, period) - 1e-6)
-    return max(1, least, round(period / step))
+    return max(_min_steps_per_row(machine, period), round(period / step))
+
+
+def _min_steps_per_row(machine: Machine, period: float) -> int:
+    """Return the steps per row of a period [s] that a machine needs, at least 1."""
+    return max(1, math.ceil(period / fine_enough(machine, period) - 1e-6))
 
 
 def first_rows(track: Track, rows: int) -> Track:
@@ -613,7 +617,8 @@ def _cross(
     noise: np.ndarray, linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
     machine, model, data, levels, step = trial
-    fine, coarse = (steps_per_row(machine, run.period, s) for s in (step, _TANGENT))
+    least = _min_steps_per_row(machine, run.period)
+    fine, coarse = (max(least, round(run.period / s)) for s in (step, _TANGENT))
     space = model_space(model)
     space.time[1] = run.start
     names, late = state_names(machine), late_readings(model, run.period)
