@@ -61,12 +61,14 @@ class ModelComparison:
         kind: `machine`, or `baseline` for a black-box model.
         runs: prediction errors, one item per run.
         plotted_prediction: (n, c) open-loop predictions of n rows and c channels of the first run.
+        lost: one sentence per run in which the model cannot even follow the readings from row to row.
     """
 
     name: str
     kind: str
     runs: tuple[RunErrors, ...]
     plotted_prediction: np.ndarray
+    lost: tuple[str, ...] = ()
 
     def mean_errors(self, horizon: str) -> np.ndarray:
         """Return the RMS prediction errors of the c channels at a horizon, averaged over the runs.
@@ -200,9 +202,13 @@ def build_comparison_document(
             "evaluated_runs": [errors.run for errors in comparisons[0].runs],
             "units": {channel: default_channel_unit(channel) for channel in dataset.channels},
             "models": models,
-            "notes": list(dataset.notes),
+            "notes": _list_notes(dataset, comparisons),
         }
     )
+
+
+def _list_notes(dataset: Dataset, comparisons: Sequence[ModelComparison]) -> list[str]:
+    return [*dataset.notes, *(note for model in comparisons for note in model.lost)]
 
 
 def _evaluate_models(
@@ -219,17 +225,19 @@ def _evaluate_models(
     compared, done = [], 0
     for name, kind, make in models:
         say(name, done / total)
-        prepare, errors, pictured = make(), [], np.empty(0)
+        prepare, errors, lost, pictured = make(), [], [], np.empty(0)
         for run in evaluated_runs:
             done += 1
             say(f"{name} on {run.name}", done / total)
             runner = prepare(run)
             errors.append(free_run_errors(runner, run, horizons))
+            if runner.lost:
+                lost.append(f"{name} on run {run.name}: {runner.lost}")
             if run is evaluated_runs[0]:
                 begin = _truncate_run_for_plot(run)
                 pictured = chained(runner, begin, _choose_plot_horizon(horizons, run))
         done += 1
-        compared.append(ModelComparison(name, kind, tuple(errors), pictured))
+        compared.append(ModelComparison(name, kind, tuple(errors), pictured, tuple(lost)))
     return compared
 
 
@@ -335,7 +343,7 @@ def _print(
     if fitted:
         trained = ", ".join(run.name for run in dataset.fit)
         stdout_console.print(f"{', '.join(fitted)}: fitted on {trained}")
-    for note in dataset.notes:
+    for note in _list_notes(dataset, comparisons):
         stdout_console.print(f"[yellow]note[/] {note}")
 
 

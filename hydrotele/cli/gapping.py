@@ -4,9 +4,11 @@ The result is a report, `gap.json`, a recording and the patched machine. The mod
 hydraulic machines as well as mechanisms without hydraulics that are given as MJCF.
 """
 
+import contextlib
 import dataclasses
+import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +32,13 @@ from hydrotele.core.files import models_folder
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.description import effect_title, headline, verdict_words
+from hydrotele.gap.interim import Interim
 from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
 from hydrotele.gap.result import Gap, finite, gap_document, in_customary_units
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
 from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.logs.dataset import Dataset, load_dataset
-from hydrotele.machine.machine_file import MACHINE_FILE
+from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.simulate.driven_chain import open_loop_errors
 from hydrotele.simulate.native import stop_profiling_clock
 
@@ -55,7 +58,7 @@ def gap_to_folder(
     """Find the effects that explain the differences (gap) between a machine model and its logs.
 
     The results are printed and written to a folder, with the corrected machine. The output folder is
-    written completely or not at all.
+    written completely or not at all. Until then, `TARGET.interim` beside it holds the best answer so far.
 
     Args:
         data: log files, folders of logs, run folders.
@@ -85,11 +88,50 @@ def gap_to_folder(
     stop_profiling_clock()
     model = load_machine_for_logs(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
-    gap = _run_search(dataset, effects, jobs, quiet=as_json)
-    with atomic_folder(target, "gap") as folder:
-        write_gap_files(gap, dataset, folder, recording, data)
+    with keep_interim_answer(target) as keep:
+        gap = _run_search(dataset, effects, jobs, as_json, keep)
+        with atomic_folder(target, "gap") as folder:
+            write_gap_files(gap, dataset, folder, recording, data)
     print_result(gap_document(gap), as_json, lambda: _print(gap), target)
     return target
+
+
+@contextlib.contextmanager
+def keep_interim_answer(target: Path) -> Iterator[Callable[[Interim], None]]:
+    """Keep the best answer so far in the folder `TARGET.interim`, until the final folder is complete.
+
+    If the context ends with an error or with Ctrl-C, the folder stays and its path is printed (stderr).
+
+    Args:
+        target: the final folder.
+
+    Yields:
+        A function that writes an answer: `interim.json` and the corrected machine, `machine.yaml`.
+
+    Raises:
+        InputError: the interim folder cannot be written.
+    """
+    place = target.with_name(f"{target.name}.interim")
+    check_output_folder(place, "interim gap")
+    written = []
+
+    def write(answer: Interim) -> None:
+        with atomic_folder(place, "interim gap") as folder:
+            write_json(folder / "interim.json", answer.document)
+            save_machine(answer.machine, folder / MACHINE_FILE)
+            write_json(folder / "summary.json", {"kind": "interim gap", "hydrotele": hydrotele.__version__})
+        written.append(place)
+
+    try:
+        yield write
+    except BaseException:
+        if written:
+            stderr_console.print(
+                f"The search did not end; its best answer so far is in {place}: interim.json and {MACHINE_FILE}.",
+                soft_wrap=True,
+            )
+        raise
+    shutil.rmtree(place, ignore_errors=True)
 
 
 def write_gap_files(
@@ -275,11 +317,13 @@ def compute_open_loop_errors(
     return out
 
 
-def _run_search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
+def _run_search(
+    dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool, keep: Callable[[Interim], None]
+) -> Gap:  # fmt: skip
     from hydrotele.gap.find import find_gap
 
     with show_stages(f"gap {dataset.machine.name}", quiet) as progress:
-        return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2)
+        return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2, keep=keep)
 
 
 def _print(gap: Gap) -> None:

@@ -25,6 +25,7 @@ OUTPUT_FILES = {
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
         "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
     ),
+    "interim gap": ("interim.json", "machine.*", "machine_assets/*"),
     "compare": ("compare.json", "*.png"),
     "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",
                           "calibrated.urdf"),

@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from hydrotele.estimate.filter import MEMORY
-from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.hypothesis import DomainError, Guess
 from hydrotele.estimate.levels import find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,
@@ -114,11 +114,14 @@ class Evidence:
     ):  # fmt: skip
         """Take the runs to judge by and the largest step [s]; `close` ends the workers.
 
+        A search calls `keep` with every guess that it accepts.
+
         With `lacking`, or where a channel's accuracy is not stated, noise levels are found from
         the data for every base (`estimate.levels`); otherwise they are those that are stated.
         """
         self.step, self.lacking = step, lacking or not known_levels(data)
         self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
+        self.keep: Callable[[Judged], None] = lambda judged: None
         self._pool = ThreadPoolExecutor(_threads(jobs, len(self.runs)))
         self.tracks: tuple[Track, ...] = ()
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
@@ -126,8 +129,8 @@ class Evidence:
         self._information = list[str](), np.zeros((0, 0))
 
     def close(self) -> None:
-        """End the workers."""
-        self._pool.shutdown()
+        """End the workers; what has not begun is dropped."""
+        self._pool.shutdown(cancel_futures=True)
 
     def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
         """Tracks with gains of their own and the levels that the machine states."""
@@ -140,8 +143,15 @@ class Evidence:
         With `same`, the base is nearly the same machine: its Jacobians are used again, which is
         enough on the way to a fit, not for comparing it. With `reopened`, unknown inputs that the
         base has no need of are tried again: a guess with fewer parts may need them.
+
+        A guess outside the model's domain has zero likelihood: the tracks of the base, an infinite loss.
         """
-        machine = guess.machine(self.data.machine)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            if not self.tracks:
+                raise
+            return Judged(guess, self.tracks, np.inf)
         if not self.lacking:
             tracks = self.track(machine)
         else:
@@ -156,7 +166,10 @@ class Evidence:
         What the base needs where it does not follow the readings at all may hide what a guess does.
         Unknown inputs that the given levels lack are tried, too.
         """
-        machine = guess.machine(self.data.machine)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            return Judged(guess, self.tracks, np.inf)
         tracks = self.map(
             lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
             self.tracks,
@@ -196,10 +209,15 @@ class Evidence:
 
         What another step than the evidence's own changes for the base is taken out, lest an effect
         be preferred because it makes up for the integrator. With `parallel` the workers take a run
-        each, which must not be asked for from within one.
+        each, which must not be asked for from within one. Outside the model's domain, and from where a
+        filter breaks down, all errors have the largest size that counts.
         """
-        step, machine = step or self.step, guess.machine(self.data.machine)
+        step = step or self.step
         tracks = self.tracks if tracks is None else tracks
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            return np.full(sum(track.whitened.size for track in tracks), _CLIP)
 
         def one(track: Track) -> np.ndarray:
             return self._errors(machine, track, step) + self._made_by(step, track)
@@ -235,7 +253,11 @@ class Evidence:
         """
         if step > MIDDLE and not self._is_smooth(step):
             step = MIDDLE
-        return fine_enough(guess.machine(self.data.machine), step)
+        try:
+            machine = guess.machine(self.data.machine)
+        except DomainError:
+            machine = self._base.machine(self.data.machine)
+        return fine_enough(machine, step)
 
     def map(self, function: Callable, items: Sequence) -> list:
         """Apply a function to items on the workers."""
@@ -245,14 +267,21 @@ class Evidence:
         self, guess: Guess, errors: np.ndarray, parallel: bool = True, step: float | None = None,
         first: int = 0,
     ) -> np.ndarray:  # fmt: skip
-        """(E, P - first) change of the errors per deviation, from the given one on."""
-        nudges = guess.nudges()
+        """(E, P - first) change of the errors per deviation, from the given one on.
+
+        Differences are taken to the other side where the first one is outside the model's domain; 0 where
+        both are.
+        """
+        nudges, machine = guess.nudges(), self.data.machine
 
         def column(index: int) -> np.ndarray:
-            moved = guess.deviation
-            nudge = nudges[index]
-            moved[index] += nudge
-            return (self.errors(guess.at(moved), step) - errors) / nudge
+            for nudge in (nudges[index], -nudges[index]):
+                moved = guess.deviation
+                moved[index] += nudge
+                there = guess.at(moved)
+                if np.array_equal(there.deviation, moved) and there.is_in_domain(machine):
+                    return (self.errors(there, step) - errors) / nudge
+            return np.zeros(len(errors))
 
         columns = range(first, len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
@@ -324,13 +353,14 @@ class Evidence:
         """(E, P) slopes of the base from differences along the directions of an information."""
         base, sizes, ways = self._base, *np.linalg.eigh(information)
         here = base.deviation
-        moves = (_MOVE / np.sqrt(sizes)) * ways
+        moves = (_MOVE / np.sqrt(np.maximum(sizes, 1.0))) * ways  # 1 of the prior; less is rounding
         for way in moves.T:  # to the side where bounds leave more room
             ahead, back = (base.at(here + s * way).deviation - here for s in (1.0, -1.0))
             way[:] = ahead if ahead @ ahead >= back @ back else back
 
         def change(way: np.ndarray) -> np.ndarray:
-            return self.errors(base.at(here + way), step) - errors
+            moved = base.at(here + way)
+            return self.errors(moved, step) - errors if moved.is_in_domain(self.data.machine) else np.zeros(len(errors))
 
         changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
         return (np.linalg.pinv(moves.T) @ np.array(changes)).T
@@ -399,7 +429,7 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
     if not len(d):  # a guess of nothing, or of what is held
         return d
     weight = guess.prior_weight
-    root = np.linalg.cholesky(slopes.T @ slopes + np.diag(weight))
+    root = factor_information(slopes.T @ slopes + np.diag(weight))
     target = -solve_triangular(root, slopes.T @ errors + weight * d, lower=True)
     move = solve_triangular(root.T, target)
     low, high = (np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high"))
@@ -407,6 +437,34 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
         return move
     # a trace beyond the ends, so that `at` puts what ends there at its end exactly
     return lsq_linear(root.T, target, (low - _TRACE, high + _TRACE), method="bvls").x
+
+
+_LEAST_EIGENVALUE = 1.0e-12  # of an information scaled to a unit diagonal: below it is rounding
+
+
+def factor_information(information: np.ndarray) -> np.ndarray:
+    """Return the lower Cholesky factor (P, P) of a symmetric information (P, P), scaled so that it exists.
+
+    Its rows and columns are scaled to a unit diagonal, and rounding is kept from making it indefinite.
+    """
+    scale = np.sqrt(np.diag(information))
+    scaled = information / np.outer(scale, scale)
+    scaled = 0.5 * (scaled + scaled.T) + _LEAST_EIGENVALUE * np.eye(len(scale))
+    return scale[:, None] * np.linalg.cholesky(scaled)
+
+
+def invert_information(information: np.ndarray) -> np.ndarray:
+    """Return the covariance (P, P) of an information (P, P) that includes a unit prior of each deviation.
+
+    Its eigenvalues are at least 1, that of the prior; less is rounding. So no variance is negative, and none
+    exceeds that of the prior.
+
+    >>> import numpy as np
+    >>> bool(np.all(np.diag(invert_information(np.full((3, 3), 1e30) + np.eye(3))) > 0.0))
+    True
+    """
+    sizes, directions = np.linalg.eigh(0.5 * (information + information.T))
+    return (directions / np.maximum(sizes, 1.0)) @ directions.T
 
 
 def occam_penalty(information: np.ndarray, last: int) -> float:
@@ -431,7 +489,8 @@ def _blocks(track: Track, seconds: float) -> np.ndarray:
     """-2 log likelihood of stretches of a run; the last, shorter one joins the one before."""
     there = np.isfinite(track.whitened)
     width = np.where(there, track.gains.spread, 1.0)
-    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), 0.0).sum(axis=1)
+    lost = np.where(np.isinf(track.whitened), np.inf, 0.0)  # the filter broke down
+    rows = np.where(there, track.whitened**2 + 2.0 * np.log(width), lost).sum(axis=1)
     count = max(1, int(len(rows) * track.run.period / seconds))
     edges = np.linspace(0, len(rows), count + 1).astype(int)
     return np.add.reduceat(rows, edges[:-1])
@@ -472,7 +531,7 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     else:
         slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
-    covariance = np.linalg.inv(information)
+    covariance = invert_information(information)
     noisy = np.maximum(np.diag(covariance), _sandwich(evidence, slopes, covariance))
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0

@@ -591,7 +591,8 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         out: Crossing, written.
 
     Returns:
-        -2 log likelihood without its constant; infinite if the states broke down.
+        -2 log likelihood without its constant; infinite if the states broke down. From that row on,
+        whitened errors are infinite where there is a reading, and predictions are NaN.
 
     Source: Anderson and Moore 1979, Optimal Filtering, chapters 6 and 8; sequential readings.
     """
@@ -642,21 +643,11 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
             for s in range(few):
                 error -= hc[s] * delta[s]
             if fresh:
-                total = noise[row, c]
-                pull[:] = 0.0
-                for k in range(full):  # a reading depends on few states
-                    if hc[k] != 0.0:
-                        for s in range(full):
-                            pull[s] += covariance[k, s] * hc[k]
-                for s in range(full):
-                    total += hc[s] * pull[s]
+                total = update_covariance(covariance, hc, noise[row, c], pull, gain[row, c])
+                if not total > 0.0:
+                    _mark_unpredicted(reading, whitened, predicted, corrected, row)
+                    return math.inf
                 width[row, c] = math.sqrt(total)
-                for s in range(full):
-                    gain[row, c, s] = pull[s] / total
-                for s in range(full):
-                    part = gain[row, c, s]
-                    for k in range(full):
-                        covariance[s, k] -= part * pull[k]
             for s in range(few):
                 delta[s] += gain[row, c, s] * error
             whitened[row, c] = error / width[row, c]
@@ -665,6 +656,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
         for s in range(size):
             corrected[row, s] = z[s]
         if not math.isfinite(loss):
+            _mark_unpredicted(reading, whitened, predicted, corrected, row)
             return math.inf
         if row == count - 1:
             break
@@ -705,6 +697,56 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                 z[r] += columns[row, i, r] * z[begin + i]
             z[begin + i] *= decay
     return loss
+
+
+_ROUNDING = 1.0e-13  # of a prediction's variance: less noise is lost in the rounding of its covariance
+
+
+@compile_without_allocation
+def update_covariance(covariance, slope, noise, pull, gain):
+    """Update a covariance with one reading: `P - K H P`, symmetric and positive definite in spite of rounding.
+
+    Args:
+        covariance: (n, n) P before the reading; overwritten.
+        slope: (n,) H, slope of the reading in the state.
+        noise: R, variance of the reading, scalar; counts as at least 1e-13 of H P H'. What it then leaves of
+            the variance, R H P H' / (R + H P H'), exceeds the rounding of the difference.
+        pull: (n,) P H', written.
+        gain: (n,) K, gain of the reading, written.
+
+    Returns:
+        `H P H' + R`, variance of the prediction error, scalar; not positive if P is not finite.
+
+    Source: Anderson and Moore 1979, Optimal Filtering, chapter 6.
+    """
+    size, spread = len(gain), 0.0
+    for s in range(size):
+        pull[s] = 0.0
+    for k in range(size):  # a reading depends on few states
+        if slope[k] != 0.0:
+            for s in range(size):
+                pull[s] += covariance[k, s] * slope[k]
+    for s in range(size):
+        spread += slope[s] * pull[s]
+    total = max(noise, _ROUNDING * spread) + spread
+    for s in range(size):
+        gain[s] = pull[s] / total
+        for k in range(s):
+            covariance[s, k] -= gain[s] * pull[k]
+            covariance[k, s] = covariance[s, k]
+        covariance[s, s] -= gain[s] * pull[s]
+    return total
+
+
+@compile_without_allocation
+def _mark_unpredicted(reading, whitened, predicted, corrected, first):
+    """Mark all rows from one on as not predicted, because the states broke down."""
+    for row in range(first, len(reading)):
+        for c in range(reading.shape[1]):
+            whitened[row, c] = math.nan if math.isnan(reading[row, c]) else math.inf
+            predicted[row, c] = math.nan
+        for s in range(corrected.shape[1]):
+            corrected[row, s] = math.nan
 
 
 @compile_without_allocation

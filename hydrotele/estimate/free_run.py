@@ -14,6 +14,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.estimate.levels import describe_lost_track, reading_resolution
 from hydrotele.estimate.reduced_model import (
     Model,
     add_sensor_drift,
@@ -23,7 +24,7 @@ from hydrotele.estimate.reduced_model import (
     read_channels,
     reduced_model,
 )
-from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, steps_per_row, track_run
+from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, state_scales, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
@@ -46,10 +47,12 @@ class Runner(NamedTuple):
         one_step: (n, c) prediction of every row's readings from all before [channel's unit].
         run: ((s,) start rows, count) -> (s, count, c) predictions of the `count` rows after each
             start, from the readings up to and with the start and from the commands alone.
+        lost: how the model fails to follow the run from row to row, in one sentence; empty if it follows.
     """
 
     one_step: np.ndarray
     run: Callable[[np.ndarray, int], np.ndarray]
+    lost: str = ""
 
 
 Prepare = Callable[[RunData], Runner]
@@ -112,6 +115,7 @@ def following_levels(data: Dataset) -> Levels:
     """
     noise, machine = data.noise.copy(), data.machine
     drift: dict[str, float] = {}
+    resolution = reading_resolution(data)
     period = data.fit[0].period
     per_time = math.sqrt(DRIFT_TIME / period)
     ahead = max(1, round(_RATE_OVER / period))
@@ -119,17 +123,35 @@ def following_levels(data: Dataset) -> Levels:
     for c in np.flatnonzero(~np.isfinite(data.noise)):
         signal, columns = parse_channel(data.channels[c]), [run.reading[:, c] for run in data.fit]
         rough = _size([np.diff(column, 2) for column in columns]) / np.sqrt(6.0)
-        noise[c] = max(rough, _SMALLEST * _size(columns), 1e-12)
+        noise[c] = max(rough, _SMALLEST * _size(columns), resolution[c])
         moves = _size([column[ahead:] - column[:-ahead] for column in columns]) / (ahead * period)
         if signal.kind.startswith("pressure_"):
             drift[f"{signal.kind}.{signal.axis}"] = moves * period * per_time
-        elif signal.axis in machine.axes and signal.kind == machine.position_kind(signal.axis):
-            joint = machine.axes[signal.axis].joint
+        elif ratio := _joint_per_reading(machine, data.channels, c):
+            joint = machine.axes[signal.axis or ""].joint
             if signal.axis in machine.hydraulic_axes:
-                drift[f"position.{joint}"] = moves * period * per_time
+                drift[f"position.{joint}"] = ratio * moves * period * per_time
             else:
-                drift[f"rate.{joint}"] = moves * share * per_time
-    return Levels(noise, drift=drift)
+                drift[f"rate.{joint}"] = ratio * moves * share * per_time
+    scales = state_scales(machine, list(drift))
+    return Levels(noise, drift={n: size / s for (n, size), s in zip(drift.items(), scales, strict=True)})
+
+
+def _joint_per_reading(machine: Machine, channels: Sequence[str], c: int) -> float:
+    """Return the travel of the joint that a channel shows per change of its reading; 0 if it shows none.
+
+    A length shows the joint of its cylinder where no position of that axis is read: range over stroke.
+    """
+    signal = parse_channel(channels[c])
+    if signal.axis not in machine.axes:
+        return 0.0
+    kind, facts = machine.position_kind(signal.axis), machine.axes[signal.axis]
+    if signal.kind == kind:
+        return 1.0
+    if signal.kind != "length" or f"{kind}.{signal.axis}" in channels or not facts.cylinder:
+        return 0.0
+    limits = machine.joints[facts.joint].range
+    return (limits[1] - limits[0]) / facts.cylinder.stroke if limits else 1.0
 
 
 def _size(parts: Sequence[np.ndarray]) -> float:
@@ -169,7 +191,7 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
                               run.period, steps, past, made)  # fmt: skip
             return out
 
-        return Runner(track.predicted, free)
+        return Runner(track.predicted, free, describe_lost_track(track, data.channels, np.inf))
 
     return prepare
 

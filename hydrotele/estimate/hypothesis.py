@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import lateral_directions, nonparallel_cylinder_axes, with_value
 from hydrotele.machine.machine import Machine
@@ -26,6 +27,13 @@ WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes
 _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
 _OPEN = ("force", "flow", "valve", "supply")  # laws of which no drawing and no data sheet tells all
 _FREEDOM = 4.0  # degrees of freedom of the t distribution of their effects' sizes
+
+
+class DomainError(InputError):
+    """A trial value is outside the domain of a model: the machine with this value is not valid.
+
+    A search assigns it zero likelihood.
+    """
 
 
 @dataclass(frozen=True)
@@ -47,11 +55,21 @@ class Hypothesis:
     change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
 
     def machine(self, nominal: Machine, deviation: np.ndarray) -> Machine:
-        """The machine that has it, at a deviation (p,)."""
+        """Return the machine that has it, at a deviation (p,).
+
+        Raises:
+            DomainError: the machine with these values is not valid.
+        """
         values = self.values(deviation)
-        if self.change:
-            return self.change(nominal, values)
-        return EFFECTS[self.name].apply(nominal, self.location, values)
+        try:
+            if self.change:
+                return self.change(nominal, values)
+            return EFFECTS[self.name].apply(nominal, self.location, values)
+        except DomainError:
+            raise
+        except (ValueError, ArithmeticError) as error:  # of the machine file's validation, or of an effect's formula
+            stated = ", ".join(f"{key} = {value:.6g}" for key, value in values.items())
+            raise DomainError(f"{self.name} at {self.location}", f"{stated} is not possible: {error}") from error
 
     @property
     def size(self) -> int:
@@ -157,6 +175,81 @@ def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
     return found
 
 
+_BISECTIONS = 20  # of the way from nominal to a bound: its end is found to a millionth
+_LOOKS = (0.3, 0.03, 0.003)  # typical deviations from nominal that a hypothesis must allow at least one of
+
+
+def limit_to_domain(candidates: Sequence[Hypothesis], machine: Machine) -> tuple[list[Hypothesis], list[DomainError]]:
+    """Restrict the bounds of hypotheses to values for which the machine is valid, and their start values.
+
+    Each parameter is taken from nominal to its bound alone, the others nominal. Values that are invalid only
+    in combination are left to the search, where they have zero likelihood.
+
+    Args:
+        candidates: the hypotheses.
+        machine: the given machine.
+
+    Returns:
+        The hypotheses that some value allows, with their bounds, and the errors of those that none does.
+    """
+    kept, errors = [], []
+    for hypothesis in candidates:
+        fault = find_domain_error(hypothesis, machine)
+        if fault is not None:
+            errors.append(fault)
+            continue
+        parameters = {}
+        for index, (key, p) in enumerate(hypothesis.parameters.items()):
+            low, high = hypothesis.low[index], hypothesis.high[index]
+            inside = [_reach(hypothesis, machine, index, end) for end in (low, high)]
+            changed = {}
+            for name, end, reach in (("lower_bound", low, inside[0]), ("upper_bound", high, inside[1])):
+                if reach != end:
+                    changed[name] = p.nominal + reach * p.prior_std
+            if changed:
+                p = replace(p, **changed)
+                p = replace(p, start_values=tuple(_start_inside(p, start) for start in p.start_values))
+            parameters[key] = p
+        kept.append(replace(hypothesis, parameters=parameters))
+    return kept, errors
+
+
+def _start_inside(p: Parameter, start: float) -> float:
+    """Return a start value, or half the way from nominal to the bound that it exceeds."""
+    inside = float(np.clip(start, p.lower_bound, p.upper_bound))
+    return start if inside == start else 0.5 * (p.nominal + inside)
+
+
+def find_domain_error(hypothesis: Hypothesis, machine: Machine) -> DomainError | None:
+    """Return why no value near nominal is possible; None if one of its starts or a small change is."""
+    fault = None
+    small = [sign * size * np.ones(hypothesis.size) for size in _LOOKS for sign in (1.0, -1.0)]
+    for deviation in (*(s for s in hypothesis.starts if np.any(s)), *small):
+        try:
+            hypothesis.machine(machine, np.clip(deviation, hypothesis.low, hypothesis.high))
+            return None
+        except DomainError as error:
+            fault = error
+    return fault
+
+
+def _reach(hypothesis: Hypothesis, machine: Machine, index: int, end: float) -> float:
+    """Return the deviation of a parameter farthest from nominal towards an end that is possible."""
+
+    def is_possible(size: float) -> bool:
+        deviation = np.zeros(hypothesis.size)
+        deviation[index] = size
+        return Guess(((hypothesis, deviation),)).is_in_domain(machine)
+
+    if is_possible(end) or not is_possible(0.0):
+        return end
+    inside, outside = 0.0, end
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (inside + outside)
+        inside, outside = (middle, outside) if is_possible(middle) else (inside, middle)
+    return inside
+
+
 def with_shape(hypothesis: Hypothesis, machine: Machine) -> Hypothesis | None:
     """A library effect with its optional numbers, too, which come last; None if it has no more."""
     known = EFFECTS.get(hypothesis.name)
@@ -221,8 +314,20 @@ class Guess:
         steps = [h.nudges(d, size) for h, d in self.parts]
         return np.concatenate(steps) if steps else np.zeros(0)
 
+    def is_in_domain(self, nominal: Machine) -> bool:
+        """Return whether the machine with all these effects is valid."""
+        try:
+            self.machine(nominal)
+        except DomainError:
+            return False
+        return True
+
     def machine(self, nominal: Machine) -> Machine:
-        """The machine that has all these effects."""
+        """Return the machine that has all these effects.
+
+        Raises:
+            DomainError: it is not valid.
+        """
         for hypothesis, deviation in self.parts:
             nominal = hypothesis.machine(nominal, deviation)
         return nominal

@@ -25,11 +25,18 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
-from hydrotele.estimate.filter import Input, decay, input_columns, input_sizes, possible_inputs
+from hydrotele.core.errors import InputError
+from hydrotele.estimate.filter import (
+    Input,
+    decay,
+    input_columns,
+    input_sizes,
+    possible_inputs,
+    update_covariance,
+)
 from hydrotele.estimate.reduced_model import state_names
 from hydrotele.estimate.track import (
     DRIFT,
-    STARTLE,
     STEP,
     Levels,
     Track,
@@ -119,25 +126,14 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
                 width[row, c] = np.nan
                 continue
             h = run.slope[row, c]
-            total = noise[row, c]
-            pull[:] = 0.0
-            for k in range(size):  # a reading depends on few states
-                if h[k] != 0.0:
-                    y -= h[k] * d[k]
-                    for s in range(size):
-                        pull[s] += p[k, s] * h[k]
-            for s in range(size):
-                total += h[s] * pull[s]
+            for k in range(size):
+                y -= h[k] * d[k]
+            total = update_covariance(p, h, noise[row, c], pull, gain[row, c])
             width[row, c] = np.sqrt(total)
             whitened[row, c] = y / width[row, c]
             loss += y * y / total + np.log(total)
             for s in range(size):
-                gain[row, c, s] = pull[s] / total
                 d[s] += gain[row, c, s] * y
-            for s in range(size):
-                part = gain[row, c, s]
-                for k in range(size):
-                    p[s, k] -= part * pull[k]
         if row == rows - 1:
             break
         for s in range(size):
@@ -344,6 +340,7 @@ _TOLD_JITTER = 0.3  # of its variance: standard deviation with which a channel t
 _ALIKE = 0.5  # of its variance, by which channels may differ beside that
 _ROWS = 3000  # of all runs together that tell the levels; more say the same again
 _ITERATIONS = 12  # of a round: what is left of the way is small against a round's own linearisation
+_IMPOSSIBLE = 1.0e100  # -2 log likelihood of levels at which a linear filter breaks down
 _SETTLED = 1.0  # change of -2 log likelihood that ends the rounds
 _PARTS = (1.0, 0.5, 0.2)  # of the way to new levels, where teeth make the linear form doubtful
 _LOOSE = {"rate": 0.02, "drive_rate": 0.02, "spool": 0.02, "pressure_head": 1e5,
@@ -356,20 +353,58 @@ def rough_noise(data: Dataset) -> np.ndarray:
     """(c,) noise of one logged reading, from third differences of the runs [channel's unit].
 
     They take out what moves slowly against the rows; what moves faster makes it too large. Never
-    less than a converter's step over sqrt(12).
+    less than the resolution of the readings, see `reading_resolution`. Of a channel that is logged at a
+    lower rate than the rows, differences between its own readings count.
     """
-    found = np.zeros(len(data.channels))
-    for c, channel in enumerate(data.channels):
-        values = np.concatenate([
-            np.diff(run.reading[:, c],
-            n=3) * (1.0 if run.readings_per_mean is None else run.readings_per_mean[c] ** 0.5)
-            for run in data.fit
-        ])  # fmt: skip
+    found, resolution = np.zeros(len(data.channels)), reading_resolution(data)
+    for c in range(len(data.channels)):
+        columns = [run.reading[:, c] for run in data.fit]
+        counts = [1.0 if run.readings_per_mean is None else run.readings_per_mean[c] ** 0.5 for run in data.fit]
+
+        def differences(columns: list[np.ndarray], counts: list[float] = counts) -> np.ndarray:
+            parts = [np.diff(column, n=3) * count for column, count in zip(columns, counts, strict=True)]
+            return np.concatenate(parts)
+
+        values = differences(columns)
         values = values[np.isfinite(values)]
+        if not len(values):
+            values = differences([column[np.isfinite(column)] for column in columns])
         spread = 1.4826 * np.median(np.abs(values)) if len(values) else 0.0
         if spread == 0.0 and len(values):  # more than half of the readings repeat
             spread = float(np.std(values))
-        found[c] = max(spread / np.sqrt(20.0), _rounding(data, channel), 1e-12)
+        found[c] = max(spread / np.sqrt(20.0), resolution[c])
+    return found
+
+
+_MAX_BITS = 20  # of a converter: no logged reading resolves more of its range
+_SAME_READING = 1e-9  # of a channel's size: readings that differ by less are equal but for rounding
+_CHANNEL_SIZES = {"pressure_head": 1e6, "pressure_rod": 1e6, "pressure_supply": 1e6}  # Pa; else 1 rad or 1 m
+
+
+def reading_resolution(data: Dataset) -> np.ndarray:
+    """Return the smallest noise that readings can have: that of their rounding.
+
+    It is the step between logged values over sqrt(12). The step is the largest of: that of the stated
+    converter, the smallest difference between two different readings, and the channel's range (or its size
+    where it is constant) divided by 2^20.
+
+    Args:
+        data: the logs; its fit runs count.
+
+    Returns:
+        (c,) standard deviations [channel's unit], above 0.
+    """
+    found = np.zeros(len(data.channels))
+    for c, channel in enumerate(data.channels):
+        values = np.concatenate([run.reading[:, c] for run in data.fit])
+        values = np.unique(values[np.isfinite(values)])
+        size = float(np.max(np.abs(values), initial=0.0)) or _CHANNEL_SIZES.get(channel.partition(".")[0], 1.0)
+        span = float(np.ptp(values)) if len(values) else 0.0
+        steps = np.diff(values)
+        step = float(np.min(steps[steps > _SAME_READING * size], initial=np.inf))
+        finest = max(span or size, _SAME_READING * size) / 2.0**_MAX_BITS
+        step = finest if not np.isfinite(step) else max(step, finest)
+        found[c] = max(step / 12.0**0.5, _rounding(data, channel))
     return found
 
 
@@ -407,10 +442,9 @@ def noise_prior(data: Dataset) -> Prior:
     rough, stated = rough_noise(data), np.isfinite(data.noise)
     noise = np.where(stated, data.noise, rough)
     width = np.where(stated, _STATED, 2.0 * _STATED)
-    rounding = np.array([_rounding(data, channel) for channel in data.channels])
     quieter = np.where(stated, _QUIETER, _QUIETER_UNSTATED)
-    low = np.maximum(quieter * np.minimum(noise, rough), rounding)  # an encoder's error at rest
-    return Prior(noise, width, low, _NOISIER * rough)
+    low = np.maximum(quieter * np.minimum(noise, rough), reading_resolution(data))  # an encoder's error at rest
+    return Prior(noise, width, low, np.maximum(_NOISIER * rough, low))
 
 
 def find_levels(
@@ -432,21 +466,29 @@ def find_levels(
         reopened: whether inputs that `start` lacks are tried again.
 
     Returns:
-        Tracks of the fit runs with these levels, linearised.
+        Tracks of the fit runs with these levels, linearised. Where the filter of a machine like that of
+        `start` breaks down, its tracks have an infinite loss.
+
+    Raises:
+        CannotFollowError: without `start`, and the filter breaks down.
     """
     prior = noise_prior(data)
     if start:
         levels = start[0].levels
         levels = _reopened(levels, machine) if reopened else _possible(levels, machine)
         tracks = _crossed(data, machine, levels, start, each, step, same)
+        if not np.isfinite(_whole(tracks)):
+            return tracks
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
         held = [n for n in _white_states(machine, state_names(machine)) if n.startswith("position")]
         rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
         tracks = _crossed(data, machine, rough, (), each, step)
+        check_filter_follows(tracks, data.channels)
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
         tracks = _crossed(data, machine, levels, tracks, each, step)
+        check_filter_follows(tracks, data.channels)
     best = tracks
     for index in range(rounds):
         before, old = tracks, levels
@@ -462,6 +504,63 @@ def find_levels(
         if _whole(tracks) > _whole(before) - _SETTLED:
             break
     return best if start else with_jitter(data, machine, best, each, step)
+
+
+class CannotFollowError(InputError):
+    """The filter of a model cannot follow the readings: the states broke down, or errors far exceed their noise."""
+
+
+MAX_ERROR_RATIO = 10.0  # RMS one-step error over its predicted standard deviation, which includes the residual
+# inputs: 1 of a consistent filter, whatever the model lacks; 10 of one whose spreads mean nothing
+_LIKELY_REASONS = (
+    "Likely reasons: a wrong unit, sign or column of this channel or of a command; a home position or a linkage"
+    " that does not reach the first readings; areas, chamber volumes or masses that are off by a large factor;"
+    " a log rate that is too low for this drive."
+)
+
+
+def check_filter_follows(
+    tracks: Sequence[Track], channels: Sequence[str], max_ratio: float = np.inf
+) -> None:  # fmt: skip
+    """Check that a filter follows the readings.
+
+    Args:
+        tracks: of the runs.
+        channels: names of the c channels.
+        max_ratio: largest RMS of the whitened one-step errors of a channel [1].
+
+    Raises:
+        CannotFollowError: the states broke down, or the errors of a channel exceed `max_ratio`; the message
+            states the channel, the size of its errors and the likely reasons.
+    """
+    for track in tracks:
+        if text := describe_lost_track(track, channels, max_ratio):
+            raise CannotFollowError(f"run {track.run.name}", f"{text} {_LIKELY_REASONS}")
+
+
+def describe_lost_track(track: Track, channels: Sequence[str], max_ratio: float = MAX_ERROR_RATIO) -> str:
+    """Return how a filter fails to follow a run, in one sentence; empty if it follows.
+
+    Args:
+        track: of the run.
+        channels: names of the c channels.
+        max_ratio: largest RMS of the whitened one-step errors of a channel [1].
+    """
+    lost = np.isinf(track.whitened).any(axis=1)
+    until = int(np.argmax(lost)) if lost.any() else len(lost)
+    errors = np.clip(track.whitened[: max(until, 1)], -1e12, 1e12)  # 1e12: large, and its square is a number
+    count = np.maximum(np.isfinite(errors).sum(axis=0), 1)
+    ratio = np.sqrt(np.nansum(errors**2, axis=0) / count)
+    worst = int(np.argmax(ratio))
+    size = f"its one-step error is {ratio[worst]:.3g} times its noise"
+    if lost.any():
+        time = track.run.start + until * track.run.period
+        return (
+            f"the model cannot follow channel {channels[worst]}: {size} until {time:.3g} s, where its states diverge."
+        )
+    if ratio[worst] > max_ratio:
+        return f"the model cannot follow channel {channels[worst]}: {size}."
+    return ""
 
 
 def with_jitter(
@@ -504,10 +603,8 @@ def _agree_on_jitter(tracks: Sequence[Track]) -> bool:
     levels = tracks[0].levels
     slope = information = np.zeros(len(levels.noise))
     for track in tracks:
-        names = list(track.names)
-        drift = state_drift(names, levels, track.run.period)
-        linear = linear_run(track, by_kind(names, STARTLE) ** 2)
-        found = smooth(linear, row_variances(levels, track.run), drift)
+        linear = linear_run(track, track.unknown_command_variances)
+        found = smooth(linear, row_variances(levels, track.run), track.process_variances)
         shares = levels.jitter**2 * squared_rates(track.run) / found.width**2
         slope = slope + np.nansum(shares * (found.whitened**2 - 1.0), axis=0)
         information = information + np.nansum(shares**2, axis=0)
@@ -625,12 +722,13 @@ def _most_likely(
 ) -> Levels:  # fmt: skip
     """Levels of the largest posterior probability in the linearised runs; jitter if asked for."""
     names, c, m = list(tracks[0].names), len(data.channels), len(levels.inputs)
+    scales = tracks[0].scales
     white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
     w = c + m
     end = w + len(white)
     rows = max(_ROWS // len(tracks), _ROWS // 8)
-    runs = [_part(track, names, rows, levels.jitter > 0.0) for track in tracks]
+    runs = [_part(track, rows, levels.jitter > 0.0) for track in tracks]
     weight = sum(len(t.run.command) for t in tracks) / sum(len(run[0].error) for run in runs)
     largest = input_sizes(machine, levels.inputs)
     first = len(names) - m
@@ -647,14 +745,17 @@ def _most_likely(
 
         def one(part: tuple) -> tuple[float, np.ndarray, np.ndarray, float]:
             run: RunData = part[1]
-            drift = state_drift(names, now, run.period)
+            drift = state_drift(names, now, run.period, scales)
             found = smooth(part[0], row_variances(now, run, part[2]), drift, rates=part[2])
             noise = now.noise**2 if run.readings_per_mean is None else now.noise**2 / run.readings_per_mean
             per_jitter = now.jitter**2 * found.jitter_slope
             return found.loss, noise * found.noise_slope, drift * found.drift_slope, per_jitter
 
         total = 0.0
-        for value, per_noise, per_drift, per_jitter in each(one, runs):
+        found = list(each(one, runs))
+        if not all(np.isfinite(value) for value, *_ in found):
+            return _IMPOSSIBLE, slope
+        for value, per_noise, per_drift, per_jitter in found:
             total += value
             slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]
@@ -690,11 +791,11 @@ def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
     return [n for n in names if n.partition(".")[0] in WHITE or n in held]
 
 
-def _part(track: Track, names: list[str], rows: int, jittered: bool) -> tuple[LinearRun, RunData, np.ndarray | None]:
+def _part(track: Track, rows: int, jittered: bool) -> tuple[LinearRun, RunData, np.ndarray | None]:
     """The stretch of a run in which the commands change most: linearised, and its squared rates."""
     busy = find_exciting_segment(track.run, rows)
     rates = np.ascontiguousarray(squared_rates(track.run)[busy]) if jittered else None
-    linear = linear_run(track, by_kind(names, STARTLE) ** 2, busy)
+    linear = linear_run(track, track.unknown_command_variances, busy)
     return linear, track.run.select_rows(busy.start, busy.stop), rates
 
 
@@ -720,17 +821,15 @@ def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = No
 
 def smoothed(track: Track) -> tuple[LinearRun, Smoothed]:
     """A track's linear run, and what its smoother says of it, states included."""
-    names = list(track.names)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
-    return run, smooth(run, row_variances(track.levels, track.run), drift, True)
+    run = linear_run(track, track.unknown_command_variances)
+    return run, smooth(run, row_variances(track.levels, track.run), track.process_variances, True)
 
 
 def undisturbed_loss(track: Track) -> float:
     """-2 log likelihood to expect of a track whose unknown inputs were nothing, noise as found."""
     names, m = list(track.names), len(track.levels.inputs)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
+    run = linear_run(track, track.unknown_command_variances)
+    drift = track.process_variances
     initial = run.initial.copy()
     first = len(names) - m
     drift[first:], initial[first:] = 0.0, 0.0
@@ -755,8 +854,8 @@ def input_excess(track: Track) -> float:
     if not track.levels.inputs:
         return 0.0
     names, m = list(track.names), len(track.levels.inputs)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
-    drift = state_drift(names, track.levels, track.run.period)
+    run = linear_run(track, track.unknown_command_variances)
+    drift = track.process_variances
     noise = row_variances(track.levels, track.run)
     loss = smooth(run, noise, drift).loss
     drift[len(names) - m :] = 0.0

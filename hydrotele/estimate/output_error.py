@@ -559,7 +559,7 @@ def _descend(problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndar
         while fall <= 0.0 and damping < largest:
             damped = information + damping * np.diag(np.diag(information))
             step = np.linalg.solve(damped, -slope)
-            tried = _point(problem, now.guess.at(now.guess.deviation + step), now.leads)
+            tried = _trial(problem, now, now.guess.at(now.guess.deviation + step))
             fall = loss - _loss(tried, weights, scale)
             damping = damping / factor if fall > 0.0 else damping * factor
         if fall > 0.0:
@@ -576,16 +576,27 @@ def _point(problem: _Problem, guess: Guess, leads: list[np.ndarray] | None = Non
     return _Point(guess, machine, leads, problem.errors(machine, leads))
 
 
+def _trial(problem: _Problem, now: _Point, guess: Guess) -> _Point:
+    """Return a point with another guess and the starts of a point; outside the model's domain all errors are `_FAR`."""
+    if guess.is_in_domain(problem.data.machine):
+        return _point(problem, guess, now.leads)
+    return replace(now, guess=guess, errors=np.where(np.isnan(now.errors), np.nan, _FAR))
+
+
 def _columns(problem: _Problem, now: _Point, scale: np.ndarray) -> np.ndarray:
     """(r, c, P) slopes of the scaled errors in the deviations, 0 without a reading."""
     deviation, nudges = now.guess.deviation, now.guess.nudges(_NUDGE)
 
     def column(p: int) -> np.ndarray:
-        moved = deviation.copy()
-        moved[p] += nudges[p]
-        machine = now.guess.at(moved).machine(problem.data.machine)
-        slope = (problem.errors(machine, now.leads) - now.errors) / (nudges[p] * scale)
-        return np.where(np.isnan(now.errors), 0.0, slope)
+        for nudge in (nudges[p], -nudges[p]):  # to the other side where the first is outside the domain
+            moved = deviation.copy()
+            moved[p] += nudge
+            there = now.guess.at(moved)
+            if np.array_equal(there.deviation, moved) and there.is_in_domain(problem.data.machine):
+                machine = there.machine(problem.data.machine)
+                slope = (problem.errors(machine, now.leads) - now.errors) / (nudge * scale)
+                return np.where(np.isnan(now.errors), 0.0, slope)
+        return np.zeros(now.errors.shape)
 
     return np.stack(list(problem.pool.map(column, range(len(deviation)))), axis=2)
 

@@ -12,7 +12,7 @@ inputs of the track have taken up counted as unknown.
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ from hydrotele.estimate.filter import (
 from hydrotele.estimate.reduced_model import (
     BACKLASH,
     Model,
+    accelerate,
     load_position,
     model_space,
     place,
@@ -64,12 +65,51 @@ _WIDE = {
     "speed": 1.0, "pressure_load": 1e5, "bristle": 0.5, "delivery": 0.3,
     "added_delivery": 0.1, "memory": 0.0,
 }  # fmt: skip
+REFERENCE_TRAVEL = 0.075  # m: the tables of this module hold for longer strokes; EHA, a laboratory actuator
+REFERENCE_PRESSURE = 1.0e7  # Pa: they hold for higher feed pressures
+_TRAVELLING = ("position", "rate", "drive", "drive_rate")  # kinds of states whose size follows the travel
 _SLIP = 0.01  # m/s or rad/s, rate at which a drive may leave its load
 _LOOSE = 0.02  # of the backlash, within which a drive's rest is known once it was looked for
 _ROUGH = 1e5  # Pa, of a pressure's mean over the first rows
+_NEWTON_STEPS = 20  # from home to any pose; a linkage needs about five
 _GRID, _FINE = 7, 0.01  # rests that are tried at first, and how fine they are at last
 _MOVED = {"spool": 1.0, "spool_rate": 25.0}  # per command at the start, what it may be off by
 _BLIND = {"pressure_head": 5e6, "pressure_rod": 5e6}
+
+
+def state_scales(machine: Machine, names: Sequence[str]) -> np.ndarray:
+    """Return the sizes in which the states of a machine are counted, relative to those of the tables.
+
+    Process noise, start uncertainty and differences for derivatives are stated for machines from a
+    laboratory actuator (75 mm, 100 bar) to 20 t. Those of a smaller machine are proportional to its travel
+    and feed pressure.
+
+    Args:
+        machine: the machine.
+        names: n states, also those of late readings and residual inputs.
+
+    Returns:
+        (n,) sizes [1], at most 1; 1 for angles, spools and all other states.
+    """
+    joints = {facts.joint: name for name, facts in machine.axes.items()}
+    sizes = np.ones(len(names))
+    for s, name in enumerate(names):
+        kind, _, place = name.partition(".")
+        axis = joints.get(place, place)
+        if kind in _TRAVELLING and (travel := _sliding_travel(machine, kind, place, axis)):
+            sizes[s] = min(1.0, travel / REFERENCE_TRAVEL)
+        elif kind.startswith("pressure_") and axis in machine.hydraulic_axes:
+            sizes[s] = min(1.0, machine.max_feed_pressure(axis) / REFERENCE_PRESSURE)
+    return sizes
+
+
+def _sliding_travel(machine: Machine, kind: str, place: str, axis: str) -> float | None:
+    """Travel of a state that is a length [m]; None of an angle, or where it is not limited."""
+    if kind.startswith("drive"):
+        cylinder = machine.axes[axis].cylinder
+        return cylinder.stroke if cylinder else None
+    joint = machine.joints[place]
+    return joint.range[1] - joint.range[0] if joint.type == "slide" and joint.range else None
 
 
 def start_state(
@@ -93,7 +133,8 @@ def start_state(
     order = actuator_order(machine)
     joints = {machine.axes[a].joint: a for a in order}
     state = np.zeros(len(names))
-    wide = np.array([_WIDE[name.partition(".")[0]] for name in names])
+    scales = state_scales(machine, names)
+    wide = scales * by_kind(names, _WIDE)
     cut = run.start > run.log.time[0] + 0.5 * run.period  # out of a record, in motion
     shown = {}
     for c, name in enumerate(data.channels):
@@ -112,14 +153,47 @@ def start_state(
             state[s] = given if kind == "spool" else 0.0
             wide[s] = np.hypot(wide[s], _MOVED[kind] * given)
         elif kind in _BLIND:  # a load cylinder rests without pressure, and none shows it
-            state[s] = shown.get(f"{kind}.{axis}", 3e6)
+            state[s] = shown.get(f"{kind}.{axis}", 3e6 * scales[s])
             if f"{kind}.{axis}" not in shown:
-                wide[s] = _BLIND[kind]
+                wide[s] = _BLIND[kind] * scales[s]
     if DELIVERY_STATE in names:
         state[names.index(DELIVERY_STATE)] = _drawn(model, state)
+    _place_by_lengths(model, data, state, shown)
     spread = np.diag(wide**2)
     _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
     return state, spread
+
+
+def _place_by_lengths(model: Model, data: Dataset, state: np.ndarray, shown: Mapping[str, float]) -> None:
+    """Move the joints of cylinders whose lengths are read, and positions are not, to these lengths.
+
+    Newton's method on all of these joints at once, starting from the home position. It stops where a step
+    no longer brings the lengths closer, so that a length beyond the linkage's reach gives the nearest pose.
+    """
+    free = set(range(len(data.axes)))
+    for channel in shown:
+        kind, _, axis = channel.partition(".")
+        if kind in ("angle", "position") and axis in data.axes:
+            free.discard(data.axes.index(axis))
+    wanted = {i: shown[f"length.{data.axes[i]}"] for i in sorted(free) if f"length.{data.axes[i]}" in shown}
+    if not wanted:
+        return
+    space, n = model_space(model), len(model.mech.independent)
+    drives, lengths = list(wanted), np.array(list(wanted.values()))
+
+    def miss(moved: np.ndarray) -> np.ndarray:
+        place(model, space, moved)
+        return lengths - np.array([load_position(model, space, i) for i in drives])
+
+    left = miss(state)
+    for _ in range(_NEWTON_STEPS):
+        step = np.linalg.lstsq(space.row[drives, :n], left, rcond=None)[0]
+        moved = state.copy()
+        moved[:n] += step
+        other = miss(moved)
+        if not np.linalg.norm(other) < np.linalg.norm(left):
+            break
+        state[:], left = moved, other
 
 
 def _drawn(model: Model, state: np.ndarray) -> float:
@@ -198,6 +272,8 @@ STEP = 1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is sta
 COARSE = 4.0e-3  # s, for a first look at a candidate; at 6.7 ms an inertia that rings is not seen
 _TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, the least that a transmission asks for: its spring may ring at 150 Hz with oil
+_MAX_PHASE_RAD = 1.6  # rad of an oscillation per step, of the 2 rad at which Verlet's method is unstable
+_SLOWEST_RAD_S = 1.0  # rad/s: slower oscillations limit no step
 _RADIAN = 0.94  # of such a ring that a step may cross: that of 150 Hz in 1 ms
 
 
@@ -209,8 +285,8 @@ class Levels:
         noise: (c,) standard deviation of a logged reading [channel's unit], see `row_noise`.
         inputs: the m unknown inputs.
         sizes: (m,) their stationary standard deviations [N], [N m], [m^3/s] or [1].
-        drift: kind of state -> standard deviation of what 20 ms add to it, where that is not the
-            floor that `DRIFT` states.
+        drift: kind of state -> standard deviation of what 20 ms add to it, in units of its scale (see
+            `state_scales`), where that is not the floor that `DRIFT` states.
         jitter: standard deviation of the instants at which channels are read [s].
         penalty: -2 log prior of the levels.
     """
@@ -243,6 +319,7 @@ class Track:
         columns: (n, m, nz) what unit inputs add to the model's states over a row.
         initial: (nz, nz) covariance before the first reading, of all states; 0 with kept gains.
         flow: (n, nz, nz) transition Jacobians as of `filter_run`; empty unless asked for.
+        scales: (nz,) sizes in which the states of `names` are counted, see `state_scales`.
     """
 
     run: RunData
@@ -258,6 +335,17 @@ class Track:
     columns: np.ndarray
     initial: np.ndarray
     flow: np.ndarray
+    scales: np.ndarray
+
+    @property
+    def process_variances(self) -> np.ndarray:
+        """(nz,) variance that a row adds to the states."""
+        return state_drift(list(self.names), self.levels, self.run.period, self.scales)
+
+    @property
+    def unknown_command_variances(self) -> np.ndarray:
+        """(nz,) variance that a row with unknown command adds to the states."""
+        return (self.scales * by_kind(list(self.names), STARTLE)) ** 2
 
 
 _NUDGE = {
@@ -293,7 +381,7 @@ _DOUBT = 3.0  # times a reading's noise: lacks of pressure below it are taken fo
 _LOOK = 3.0  # s at a run's start that tell where drives rested in their backlash
 
 
-def by_kind(names: list[str], table: Mapping[str, float]) -> np.ndarray:
+def by_kind(names: Sequence[str], table: Mapping[str, float]) -> np.ndarray:
     """(nz,) numbers of a table by state or kind of state; 0 for what it lacks."""
     return np.array([table.get(name, table.get(name.partition(".")[0], 0.0)) for name in names])
 
@@ -303,14 +391,63 @@ def fine_enough(machine: Machine, step: float) -> float:
 
     A pump's own circuit is stiff, and its piston light: with stiff lines they ring at 200 Hz and
     more, which steps of some milliseconds make unstable. So does a light drive on the spring of its
-    transmission.
+    transmission, and a small valve drive on the oil of its chambers.
     """
     springs = [
         max(_STIFF, _RADIAN / natural_frequency(machine, name))
         for name, axis in machine.axes.items() if axis.transmission
     ]  # fmt: skip
     rigid = [max_pump_drive_time_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
-    return min([step, *springs, *rigid])
+    return min([step, *springs, *rigid, max_valve_drive_time_step(machine)])
+
+
+def max_valve_drive_time_step(machine: Machine) -> float:
+    """Return the longest step that resolves the mechanism's oscillation on the oil of its valve drives.
+
+    Args:
+        machine: the machine.
+
+    Returns:
+        Step [s]: 5 ms times a negative power of two, so that small parameter changes seldom change it. It is
+        below `1.6 / omega` with the highest natural frequency omega [rad/s] of the mass matrix at home and the
+        stiffness of the oil at the end of each stroke where it is highest. Infinite where 5 ms, the largest
+        step of the filter, is short enough, and without valve drives.
+
+    Source: stability limit of Verlet's method, h < 2 / omega, with a margin of 20 % for other poses.
+    """
+    if not machine.valve_axes:
+        return math.inf
+    model, names = reduced_model(machine, ()), state_names(machine)
+    space, state = model_space(model), np.zeros(len(names))
+    for s, name in enumerate(names):
+        kind, _, place_name = name.partition(".")
+        state[s] = machine.home.get(place_name, 0.0) if kind == "position" else 0.0
+    place(model, space, state)
+    accelerate(model, space, state, 0.0)
+    n = len(model.mech.independent)
+    factor, stiffness = np.tril(space.mass)[:n, :n], np.zeros((n, n))
+    for i, axis in enumerate(actuator_order(machine)[: model.hydraulic]):
+        if machine.axes[axis].valve and model.gear[i] < 0:
+            row = space.row[i]
+            stiffness += _oil_stiffness(machine, axis) * np.outer(row, row)
+    whitened = np.linalg.solve(factor, np.linalg.solve(factor, stiffness).T)
+    if not np.isfinite(whitened).all():  # an impossible mass matrix, at which the filter stops
+        return math.inf
+    omega = math.sqrt(max(float(np.linalg.eigvalsh(whitened)[-1]), _SLOWEST_RAD_S**2))
+    longest = _MAX_PHASE_RAD / omega
+    return math.inf if longest >= _TANGENT else _TANGENT * 2.0 ** math.floor(math.log2(longest / _TANGENT))
+
+
+def _oil_stiffness(machine: Machine, axis: str) -> float:
+    """Stiffness of the oil of a valve drive at the end of the stroke where it is highest [N/m] or [N m/rad]."""
+    drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
+    assert machine.supply
+    ends = np.array([0.0, cylinder.stroke if cylinder else 0.0])
+    total = np.zeros(2)
+    for area, volume in zip(drive.effective_areas, drive.chamber_volumes(ends), strict=True):
+        oil = np.maximum(volume, drive.dead_volume) / machine.supply.bulk_modulus + drive.hose_compliance
+        total += area**2 / oil
+    return float(total.max())
 
 
 def steps_per_row(machine: Machine, period: float, step: float) -> int:
@@ -324,8 +461,12 @@ def steps_per_row(machine: Machine, period: float, step: float) -> int:
     Returns:
         Their number, at least 1.
     """
-    least = math.ceil(period / fine_enough(machine, period) - 1e-6)
-    return max(1, least, round(period / step))
+    return max(_min_steps_per_row(machine, period), round(period / step))
+
+
+def _min_steps_per_row(machine: Machine, period: float) -> int:
+    """Return the steps per row of a period [s] that a machine needs, at least 1."""
+    return max(1, math.ceil(period / fine_enough(machine, period) - 1e-6))
 
 
 def first_rows(track: Track, rows: int) -> Track:
@@ -375,9 +516,9 @@ def squared_rates(run: RunData) -> np.ndarray:
     return found if run.readings_per_mean is None else found / run.readings_per_mean
 
 
-def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
-    """(nz,) variance that a row adds to the states of a track by these names."""
-    drift = period / DRIFT_TIME * by_kind(names, {**DRIFT, **levels.drift}) ** 2
+def state_drift(names: list[str], levels: Levels, period: float, scales: np.ndarray) -> np.ndarray:
+    """(nz,) variance that a row adds to the states of a track by these names, of (nz,) `scales`."""
+    drift = period / DRIFT_TIME * (scales * by_kind(names, {**DRIFT, **levels.drift})) ** 2
     m = len(levels.inputs)
     drift[len(names) - m :] = input_drift(levels.sizes, period)
     return drift
@@ -476,7 +617,8 @@ def _cross(
     noise: np.ndarray, linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
     machine, model, data, levels, step = trial
-    fine, coarse = (steps_per_row(machine, run.period, s) for s in (step, _TANGENT))
+    least = _min_steps_per_row(machine, run.period)
+    fine, coarse = (max(least, round(run.period / s)) for s in (step, _TANGENT))
     space = model_space(model)
     space.time[1] = run.start
     names, late = state_names(machine), late_readings(model, run.period)
@@ -509,8 +651,11 @@ def _cross(
     if given is not None and given.shape[1] != full:  # another number of readings on their way
         given = None
     flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
-    variances = Variances(noise, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2)
-    steps = Steps(fine, coarse, by_kind(names, _NUDGE))
+    scales = state_scales(machine, names)
+    variances = Variances(
+        noise, state_drift(names, levels, run.period, scales), (scales * by_kind(names, STARTLE)) ** 2
+    )
+    steps = Steps(fine, coarse, scales * by_kind(names, _NUDGE))
     own = np.array([names.index(name) for name in known])
     lines = Linearisation(kept is None, given is not None, own, gains, initial, flow)
     loss = filter_run(
@@ -521,7 +666,7 @@ def _cross(
     )  # fmt: skip
     return Track(
         run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,
-        initial, flow,
+        initial, flow, state_scales(machine, known),
     )  # fmt: skip
 
 

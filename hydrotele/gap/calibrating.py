@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.effects.effect import with_value
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration, numbers
 from hydrotele.estimate.output_error import (
@@ -276,7 +276,7 @@ def mostly_right(guess: Guess, fit: Fit) -> bool:
     first = 0
     for hypothesis, deviation in guess.parts:
         if hypothesis.name == CALIBRATION:
-            spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+            spread = np.sqrt(np.diag(invert_information(fit.information)))
             return _usual(deviation, spread[first : first + hypothesis.size]) < _MOSTLY
         first += hypothesis.size
     return False
@@ -306,11 +306,11 @@ def promoted(evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hyp
     keys = list(group.parameters)
     first = sum(h.size for h, _ in now.guess.parts[:place])
     own = slice(first, first + group.size)
-    usual = _usual(deviation, np.sqrt(np.diag(np.linalg.inv(fit.information)))[own])
+    usual = _usual(deviation, np.sqrt(np.diag(invert_information(fit.information)))[own])
     widths = np.ones(len(fit.information))
     widths[own] = usual
     told_by_runs = np.outer(widths, widths) * (fit.information - np.eye(len(widths)))
-    covariance = np.linalg.inv(told_by_runs + np.eye(len(widths)))[own, own]
+    covariance = invert_information(told_by_runs + np.eye(len(widths)))[own, own]
     ratios: dict[tuple[str, str], dict[int, float]] = {}
     for index, (key, d) in enumerate(zip(keys, deviation, strict=True)):
         effect = table[key].effect
@@ -526,7 +526,7 @@ def fit_until_settled(
         last = fit
         fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
         moved = fit.guess.deviation - judged.guess.deviation
-        spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+        spread = np.sqrt(np.diag(invert_information(fit.information)))
         guess = widened(fit.guess)
         if np.all(np.abs(moved) < _UNMOVED * spread):
             break

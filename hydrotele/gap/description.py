@@ -64,6 +64,8 @@ _VARIABLES = {
     "pressure_supply": "supply pressure",
 }  # fmt: skip
 _TOLD = 3  # calibrated numbers that the verdict tells
+_AT_LIMIT = 0.98  # of an input's largest size: an estimate at its bound is no size
+_UNSEEN = 0.005  # fraction of the gap that is printed as 0 %
 _SLIGHT = 0.1  # of the noise: a gap below it hardly shows in single predictions
 
 _LAWS = {
@@ -156,8 +158,12 @@ def lack_words(lack: Lack) -> str:
 
     >>> lack_words(Lack("flow_head", "boom", 2e-4, "m^3/s", 0.05))
     'Missing in the model: an oil flow into the boom head side of 12 L/min (standard deviation).'
+    >>> lack_words(Lack("force", "boom", 900.0, "N", 1.0))
+    'The model cannot follow the boom: a force on the boom drive as large as its physical limit would be missing.'
     """
     what = _LACKS[lack.balance].format(axis=lack.axis)
+    if lack.part > _AT_LIMIT:
+        return f"The model cannot follow the {lack.axis}: {what} as large as its physical limit would be missing."
     return f"Missing in the model: {what} of {amount(lack.size, lack.unit)} (standard deviation)."
 
 
@@ -254,6 +260,8 @@ def headline(gap: Gap) -> str:
         likely = (e for e in gap.effects if e.mechanism_probability > LIKELY)
         known = " and ".join(map(effect_title, likely))
         also = f"apart from {known}, " if known else ""
+        if not known and (changes := _closing_changes(gap)):
+            return f"Model and machine differ; {changes}, but the cause is not identified"
         return f"Model and machine differ; {also}no known effect explains the difference"
     titles = [effect_title(effect) for effect in gap.effects]
     if gap.verdict == "ambiguous":
@@ -263,6 +271,15 @@ def headline(gap: Gap) -> str:
         either = "Either " + " or ".join([effect_title(unsure), *rivals])
         return ", and ".join([either, *titles])
     return _capital("; ".join(map(_brief, gap.effects)))
+
+
+def _closing_changes(gap: Gap) -> str:
+    """Return which unnamed changes close which fraction of the gap; empty if they close none of it."""
+    closed = gap_closed(gap.size)
+    what = ["learned laws"] * bool(gap.learned) + ["calibrated parameters"] * bool(gap.calibration)
+    if not what or not closed > _UNSEEN:
+        return ""
+    return f"{_listed(what, 'and')} close {100 * closed:.0f} % of the gap"
 
 
 def verdict_words(gap: Gap) -> tuple[str, ...]:
@@ -312,6 +329,8 @@ def _effect(effect: NamedEffect, run: str) -> str:
     known = EFFECTS.get(effect.name)
     what = f"{effect_title(effect)} ({known.description})" if known else effect_title(effect)
     text = _capital(f"{what}: {facts}. Probability {probability_text(effect.probability)}.")
+    if effect.share < _UNSEEN:
+        return f"{text} This holds for the fitted runs; {run} does not show it, its predictions are as good without it."
     if math.isfinite(effect.share):
         text += f" Without it, {share_words(effect.share)} of the gap on {run} reappears."
     return text
@@ -399,10 +418,11 @@ def _leftover(gap: Gap) -> tuple[str, ...]:
 
 def _unknown(gap: Gap) -> tuple[str, ...]:
     size = gap.size
-    first = (
-        "Model and machine differ, and no known effect explains the difference: on"
-        f" {_run(gap)} the prediction error is {_times(size.before, size)}."
-    )
+    error = f"on {_run(gap)} the prediction error is {_times(size.before, size)}."
+    changes = _closing_changes(gap)
+    first = f"Model and machine differ, and no known effect explains the difference: {error}"
+    if changes:
+        first = f"Model and machine differ: {error} {_capital(changes)}, but no known effect has their form."
     return (first, *_located(gap))
 
 

@@ -7,10 +7,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from hydrotele.effects import locate_error_in_effect_file
 from hydrotele.effects.effect import with_value
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.filter import input_sizes, input_units
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.balances import run_balances
@@ -22,6 +23,7 @@ from hydrotele.gap.calibrating import (
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.residuals import (
     believed,
     believed_part,
@@ -87,6 +89,7 @@ def find_gap(
     progress: Progress | None = None,
     effects: Sequence[str] = (),
     jobs: int = 2,
+    keep: Callable[[Interim], None] | None = None,
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -96,9 +99,14 @@ def find_gap(
         effects: names of the effects to try; all if empty. If some are named, no law is learned
             and free runs calibrate nothing: what is lacking may be an effect that was not tried.
         jobs: processors that it may use.
+        keep: called with the best answer so far, each time that there is a better one.
 
     Returns:
         The gap, named or not.
+
+    Raises:
+        CannotFollowError: the filter of the given machine cannot follow the readings.
+        InputError: a custom effect allows no value, or its file raised an error.
     """
     begin = time.perf_counter()
     tell = progress or (lambda text, share: None)
@@ -107,9 +115,15 @@ def find_gap(
     if opened:
         data = dataclasses.replace(data, machine=opened.machine)
         notes.append(opened.note)
-    candidates = hypotheses(data.machine, effects)
+    candidates, errors = limit_to_domain(hypotheses(data.machine, effects), data.machine)
+    for error in errors:
+        if error.__cause__ and (own := locate_error_in_effect_file(error.__cause__)):
+            raise own
+        notes.append(f"Not tried: {error}.")
     data = downsample(select_exciting_segments(data))
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
+    if keep:
+        evidence.keep = keep_better(data.machine, keep, begin)
     try:
         found = search(evidence, candidates, progress)
         discovery = Discovery(found.judged, ())
@@ -120,6 +134,7 @@ def find_gap(
                 evidence.set_base(found.base)
             tell("learn laws of the unexplained difference", 0.93)
             found, discovery = _learned(evidence, found)
+            evidence.keep(discovery.judged)
             if discovery.refused:
                 notes.append(_REFUSED)
         tell("evaluate on the held-out run", 0.96)

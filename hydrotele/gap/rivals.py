@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.levels import undisturbed_loss
 from hydrotele.gap.calibrating import (
@@ -272,7 +272,7 @@ def differs_significantly(guess: Guess, fit: Fit, index: int) -> bool:
     hypothesis, deviation = guess.parts[index]
     first = sum(h.size for h in guess.hypotheses[:index])
     own = slice(first, first + hypothesis.size)
-    covariance = np.linalg.inv(fit.information)[own, own]
+    covariance = invert_information(fit.information)[own, own]
     return float(deviation @ np.linalg.solve(covariance, deviation)) > TOLD
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.hypothesis import (
     CALIBRATION,
     Guess,
@@ -27,7 +27,7 @@ from hydrotele.estimate.hypothesis import (
     numbers,
     with_shape,
 )
-from hydrotele.estimate.levels import input_excess, noise_prior
+from hydrotele.estimate.levels import MAX_ERROR_RATIO, check_filter_follows, input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (
     FIT_STEPS,
@@ -269,6 +269,8 @@ def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progr
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
+    check_filter_follows(base.tracks, evidence.data.channels, MAX_ERROR_RATIO)
+    evidence.keep(base)
     candidates = timed(candidates, base)
     grown = _begun(evidence, base, candidates, tell)
     jittered = evidence.with_jitter(grown.now)
@@ -287,6 +289,7 @@ def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progr
         grown = _sparse(evidence, base, grown, candidates, tell)
     grown = _by_number(evidence, _plain(evidence, grown, candidates), candidates)
     grown = _given_back(evidence, grown)
+    evidence.keep(grown.now)
     return _compared(evidence, base, grown, tell)
 
 
@@ -427,6 +430,7 @@ def _grow(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked, ahead = grown, settled, None, None
+        evidence.keep(now)
     return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak, toothed=toothed)
 
 
@@ -502,7 +506,7 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
         assert grown.fit
         first = sum(h.size for h in grown.now.guess.hypotheses[:index])
         own = slice(first, first + hypothesis.size)
-        covariance = np.linalg.inv(grown.fit.information)[own, own]
+        covariance = invert_information(grown.fit.information)[own, own]
         apart = np.diff(np.eye(hypothesis.size), axis=0)  # of the numbers, one from the next
         gone = apart @ deviation
         if gone @ np.linalg.solve(apart @ covariance @ apart.T, gone) > TOLD * len(gone):

@@ -15,8 +15,9 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
-from hydrotele.estimate.evidence import Evidence, Fit, standard_deviations
+from hydrotele.estimate.evidence import Evidence, Fit, invert_information, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.levels import check_filter_follows
 from hydrotele.estimate.track import Levels, known_levels, track_run
 from hydrotele.logs.dataset import Dataset, select_exciting_segments
 from hydrotele.machine.machine import Machine
@@ -103,7 +104,7 @@ def identify_hydraulics(
         The parameters and the identified machine.
 
     Raises:
-        InputError: the machine has no hydraulics.
+        InputError: the machine has no hydraulics, or its filter cannot follow the readings.
 
     Source: Ljung 1999, System identification, chapter 7 (prediction-error methods); start values
     and priors: `hydrotele.effects`.
@@ -148,10 +149,12 @@ def _fit_in_rounds(evidence: Evidence, guess: Guess, report: Callable[[str, floa
     for k in range(_MAX_ROUNDS):
         report(f"round {k + 1}", 0.9 * k / _MAX_ROUNDS)
         evidence.set_base(guess)
+        if fit is None:
+            check_filter_follows(evidence.tracks, evidence.data.channels)
         before = evidence.base_errors
         loss = float(before @ before + guess.deviation @ guess.deviation)
         fit = evidence.fit(guess, loss, steps=_STEPS_PER_ROUND)
-        spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
+        spread = np.sqrt(np.diag(invert_information(fit.information)))
         moved = np.abs(fit.guess.deviation - guess.deviation) / spread
         guess = fit.guess
         if moved.max() < _CONVERGENCE_STD:

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
+from hydrotele.gap.interim import Interim
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine
 
@@ -115,6 +116,29 @@ def test_json_is_gap_json_and_nothing_else(site, searching):
     code, out, _ = invoke("gap", "--data", "site", "--no-recording", "--json", "--out", "here")
     assert code == 0 and json.loads(out) == json.loads((site / "here" / "gap.json").read_text())
     assert "patched" in names(site / "here") and "next_experiment.yaml" in names(site / "here")
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), InputError("run fit_1", "the model cannot follow it")])
+def test_an_interrupted_search_keeps_its_best_answer_and_says_where(site, searching, gap_of, monkeypatch, stop):
+    searching("named")
+    answer = Interim(gap_of("named").patched, {"interim": True, "effects": [{"name": "payload"}]})
+
+    def stopped(dataset, progress=None, *, keep, **chosen):
+        keep(answer)
+        raise stop
+
+    whole = sys.modules["hydrotele.gap.find"].__dict__["find_gap"]
+    monkeypatch.setitem(sys.modules["hydrotele.gap.find"].__dict__, "find_gap", stopped)
+    printed = []
+    monkeypatch.setattr("hydrotele.cli.gapping.stderr_console.print", lambda text, **_: printed.append(text))
+    assert invoke("gap", "--data", "site", "--no-recording", "--out", "here")[0] != 0
+    assert names(site) == ["here.interim", "site"], "the final folder appears whole or not at all"
+    assert any("best answer so far is in here.interim" in text for text in printed)
+    assert json.loads((site / "here.interim" / "interim.json").read_text()) == answer.document
+    assert load_machine(site / "here.interim").links["payload"].mass == 250.0
+    monkeypatch.setitem(sys.modules["hydrotele.gap.find"].__dict__, "find_gap", whole)
+    assert invoke("gap", "--data", "site", "--no-recording", "--out", "here")[0] == 0
+    assert names(site) == ["here", "site"], "a search that ends leaves no interim answer"
 
 
 def test_without_a_gap_nothing_is_patched_and_nothing_old_stays(site, searching):

@@ -130,7 +130,7 @@ def test_a_calibration_is_tried_again_beside_effects_that_take_little(monkeypatc
         "strained": lambda *_: False,
     }.items():
         monkeypatch.setattr(search, name, value)
-    evidence: Any = SimpleNamespace(set_base=lambda judged: judged)
+    evidence: Any = SimpleNamespace(set_base=lambda judged: judged, keep=lambda judged: None)
     base = Judged(Guess(), (), 1000.0)
     grown = search._grow(evidence, base, search._Grown(base), added, lambda *_: None)
     assert len(grown.now.guess.parts) == 3

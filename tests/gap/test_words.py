@@ -6,11 +6,12 @@ import math
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.description import effect_title, gap_closed, headline, verdict_words
+from hydrotele.gap.description import effect_title, gap_closed, headline, lack_words, verdict_words
 from hydrotele.gap.result import (
     Alternative,
     Estimate,
     GapSize,
+    Lack,
     NamedEffect,
     amount,
     in_customary_units,
@@ -52,6 +53,32 @@ def test_beside_an_unknown_only_what_is_likely_is_said_to_be_known(gap_of):
         told = (dataclasses.replace(effect, probability=probability),)
         gap = dataclasses.replace(gap_of("unknown"), effects=told)
         assert headline(gap).endswith(f"differ; {said}no known effect explains the difference")
+
+
+def test_an_unknown_whose_gap_is_closed_does_not_say_that_nothing_explains_it(gap_of):
+    """A learned law closes all of it: what is unknown is the cause."""
+    partly = gap_of("partly")
+    size = GapSize(5.0, 1.0, 1.0)
+    gap = dataclasses.replace(partly, verdict="unknown", effects=(), calibration={}, size=size)
+    words = text_of(gap)
+    assert headline(gap) == (
+        "Model and machine differ; learned laws close 100 % of the gap, but the cause is not identified"
+    )
+    assert "Learned laws close 100 % of the gap, but no known effect has their form" in words
+    assert "no known effect explains" not in words
+
+
+def test_an_effect_that_the_heldout_run_does_not_show_has_no_share_of_zero(gap_of):
+    (effect,) = gap_of("named").effects
+    gap = dataclasses.replace(gap_of("named"), effects=(dataclasses.replace(effect, share=0.001),))
+    words = text_of(gap)
+    assert "Without it" not in words
+    assert "holds for the fitted runs; run test_1 does not show it" in words
+
+
+def test_a_residual_input_at_its_bound_is_not_a_size(gap_of):
+    at_limit = lack_words(Lack("flow_head", "boom", 1e-4, "m^3/s", 1.0))
+    assert at_limit.startswith("The model cannot follow the boom") and "L/min" not in at_limit
 
 
 def test_an_ambiguity_names_both_and_the_experiment(gap_of):
