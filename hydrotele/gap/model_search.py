@@ -1,0 +1,419 @@
+"""The gap search as one model selection: add, exchange and remove effects by their log evidence.
+
+Every model is a set of effects with parameters, perhaps with the uncertain parameters of the machine file as one dense
+group. Its log evidence has noise levels and residual inputs re-estimated for it. `docs/gap_method.md` states the model.
+
+1. Linearise the whitened errors in every effect (`gap.dictionary`) and compare all of them by their Bayes factors,
+   maximised over the size of the residual inputs and the scale of the parameter uncertainty (`gap.regression`).
+2. Refine the best few, re-estimate their noise levels, and compare their evidence.
+3. Add the best one if its Bayes factor is large enough, and repeat.
+4. Remove every effect whose removal costs less than that; exchange an effect for a better rival.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.filter import Gains
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
+from hydrotele.estimate.levels import linear_filter, linear_run
+from hydrotele.estimate.track import STARTLE, Levels, Track, by_kind, row_variances, state_drift
+from hydrotele.gap.calibrating import fit_until_settled
+from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary, list_versions
+from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns
+from hydrotele.gap.rivals import Rival, moved_last
+from hydrotele.gap.screening import Screened, timed
+from hydrotele.gap.search import Found
+from hydrotele.machine.machine import Machine
+
+MIN_LOG_BAYES_FACTOR = 20.0
+"""Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
+RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
+"""Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
+PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
+"""Standard deviations of the uncertain parameters, relative to those that the machine file states."""
+_OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
+_TRIED = 5  # candidates that are refined in each round
+_RIVALS = 3  # candidates that are refined in the place of an accepted effect
+_KEPT = 50  # effects that are linearised again after the first round
+_MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
+_SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
+_MAX_NOISE_ROUNDS = 6  # of the estimation of the noise levels
+_UNEXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A set of effects with its evidence.
+
+    Attributes:
+        judged: the effects, fitted, with their own noise levels.
+        fit: their last fit; None without effects.
+        penalty: log determinant of the posterior precision of all parameters, prior included.
+    """
+
+    judged: Judged
+    fit: Fit | None = None
+    penalty: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """-2 log evidence, up to a constant."""
+        return self.judged.loss + self.penalty
+
+    @property
+    def guess(self) -> Guess:
+        """The effects and their parameters."""
+        return self.judged.guess
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """An effect, the calibration, or both, as the linear regression proposes it.
+
+    Attributes:
+        version: the effect; None for the calibration alone.
+        deviation: (p,) where to start.
+        factor: twice its log Bayes factor.
+        residual_scale: size of the residual inputs at which it explains the data best.
+        parameter_scale: standard deviation of the uncertain parameters beside it.
+    """
+
+    version: Version | None
+    deviation: np.ndarray
+    factor: float
+    residual_scale: float
+    parameter_scale: float
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and location."""
+        return self.version.hypothesis.key if self.version else (CALIBRATION, "all")
+
+
+def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
+    """Find the effects that the data ask for.
+
+    Args:
+        evidence: on the fit runs, with noise levels that it estimates.
+        candidates: the effects.
+        progress: called with (what is done, fraction done).
+
+    Returns:
+        The model, its rivals, and the first ranking.
+    """
+    tell = progress or (lambda text, share: None)
+    tell("estimate the noise levels of the given model", 0.0)
+    given = Model(settle_noise(evidence, evidence.judged(Guess())))
+    candidates = timed([c for c in candidates if c.name not in _UNEXCLUDED], given.judged)
+    now, first = given, tuple[Proposal, ...]()
+    keys: set[tuple[str, str]] | None = None
+    for index in range(_MAX_EFFECTS):
+        share = 0.05 + 0.8 * index / _MAX_EFFECTS
+        tell(f"compare effects{_words(now)}", share)
+        pool = [c for c in candidates if keys is None or c.key in keys]
+        proposals = propose(evidence, now, pool)
+        first = first or tuple(proposals)
+        keys = keys or {p.key for p in proposals[:_KEPT]}
+        tell(f"refine the best effects{_words(now)}", share + 0.03)
+        better = best_extension(evidence, now, proposals)
+        if better is None:
+            break
+        now = settle(evidence, better)
+    tell("remove unnecessary effects", 0.87)
+    now, rests = remove_needless(evidence, given, now)
+    tell("compare alternative effects", 0.9)
+    now, rests, rivals = exchange(evidence, given, now, rests, candidates)
+    evidence.set_base(now.judged)
+    charges = tuple(
+        occam_penalty(moved_last(now.fit.information, now.guess, k), h.size) if now.fit else 0.0
+        for k, h in enumerate(now.guess.hypotheses)
+    )
+    without = tuple(
+        None if h.name == CALIBRATION else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
+    )
+    ranking = tuple(
+        Screened(p.version.hypothesis, p.factor, p.factor, p.deviation)
+        for p in first if p.version and p.factor > 0.0
+    )  # fmt: skip
+    return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
+
+
+def settle_noise(evidence: Evidence, judged: Judged) -> Judged:
+    """Re-estimate the noise levels of a model until its likelihood no longer changes; it becomes the base."""
+    for _ in range(_MAX_NOISE_ROUNDS):
+        evidence.set_base(judged)
+        again = evidence.judged(judged.guess, same=True)
+        if again.loss > judged.loss - _SETTLED:
+            break
+        judged = again
+    return evidence.set_base(judged)
+
+
+def settle(evidence: Evidence, model: Model) -> Model:
+    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base."""
+    if not model.guess.parts:
+        return Model(settle_noise(evidence, model.judged))
+    judged, fit = fit_until_settled(evidence, model.judged)
+    return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
+
+
+def _words(model: Model) -> str:
+    names = ", ".join(f"{h.name} {h.location}" for h in model.guess.hypotheses)
+    return f" beside {names}" if names else ""
+
+
+# -- linear step ------------------------------------------------------------------------------------------------------
+
+
+def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
+    """Rank effects by their Bayes factors in the linearised model.
+
+    For every size of the residual inputs and every scale of the uncertain parameters, the density of the errors
+    is known in closed form. A proposal has the largest one over both, and over the versions of its effect.
+
+    Args:
+        evidence: whose base is the model.
+        now: the model.
+        candidates: effects that may be added.
+
+    Returns:
+        One proposal per effect, and one of the calibration alone, the best first.
+    """
+    taken = {h.key for h in now.guess.hypotheses}
+    versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
+    machine = evidence.data.machine
+    names = frozenset(n for n, h in zip(now.guess.names, _owners(now.guess), strict=True) if h != CALIBRATION)
+    uncertain = Hypothesis(CALIBRATION, "all", {}) if (CALIBRATION, "all") in taken else calibration(machine, names)
+    table = build_dictionary(evidence, now.guess, versions, uncertain)
+    best: dict[tuple[str, str], Proposal] = {}
+    start = min(sum(track.loss for track in evidence.tracks), np.inf)
+    reference = None
+    for residual_scale in RESIDUAL_SCALES:
+        terms, loss = _normal_equations(evidence, now, table, residual_scale)
+        for parameter_scale in PARAMETER_SCALES:
+            if parameter_scale > 0.0 and table.own.all():
+                continue
+            scales = np.where(table.own, _OWN_SCALE, parameter_scale)
+            marginal = terms.marginalise(scales)
+            total = loss - terms.squares + marginal.loss
+            if reference is None:
+                reference, start = total, total
+            calibrated = Proposal(None, np.zeros(0), start - total, residual_scale, parameter_scale)
+            if parameter_scale > 0.0:
+                _keep(best, calibrated)
+            factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
+            for version, factor, mean in zip(table.versions, factors, means, strict=True):
+                gained = start - total + float(factor)
+                _keep(best, Proposal(version, version.deviation(mean), gained, residual_scale, parameter_scale))
+    return sorted(best.values(), key=lambda p: -p.factor)
+
+
+def _owners(guess: Guess) -> list[str]:
+    return [h.name for h in guess.hypotheses for _ in h.parameters]
+
+
+def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> None:
+    if proposal.key not in best or proposal.factor > best[proposal.key].factor:
+        best[proposal.key] = proposal
+
+
+def _normal_equations(
+    evidence: Evidence, now: Model, table: Dictionary, residual_scale: float
+) -> tuple[NormalEquations, float]:
+    """Normal equations with the residual inputs scaled, and -2 log likelihood of the errors there."""
+    edges = np.cumsum([0, *(len(t.whitened.ravel()) for t in evidence.tracks)])
+    widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
+
+    def of_run(index: int) -> tuple[NormalEquations, float]:
+        track, rows = evidence.tracks[index], slice(edges[index], edges[index + 1])
+        scaled = scale_residual_inputs(track, residual_scale)
+        columns = np.hstack([*(c[rows] for c in table.columns), table.nuisance[rows]]).astype(float)
+        missing = ~np.isfinite(track.whitened)
+        if residual_scale != 1.0:
+            there = columns.reshape(*track.whitened.shape, -1)
+            there *= np.where(missing, 0.0, track.gains.spread)[:, :, None]
+            reweight_columns(
+                track.gains.slope, track.flow, missing, track.gains.gain, scaled.gains.gain, there,
+            )  # fmt: skip
+            there /= np.where(missing, 1.0, scaled.gains.spread)[:, :, None]
+        groups = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
+        errors = -np.nan_to_num(scaled.whitened).ravel()
+        return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
+
+    found = evidence.map(of_run, range(len(evidence.tracks)))
+    terms = found[0][0]
+    for other, _ in found[1:]:
+        terms = terms + other
+    return terms, sum(loss for _, loss in found)
+
+
+def scale_residual_inputs(track: Track, scale: float) -> Track:
+    """Return a linearised track with the standard deviations of its residual inputs scaled.
+
+    The filter is run again on the track's own linearisation.
+    """
+    if scale == 1.0:
+        return track
+    names, levels = list(track.names), _scaled(track.levels, scale)
+    m = len(levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    initial = run.initial.copy()
+    first = len(names) - m
+    initial[first:] *= scale
+    initial[:, first:] *= scale
+    run = run._replace(initial=initial)
+    whitened, width = np.empty(run.error.shape), np.empty(run.error.shape)
+    gain = np.zeros(run.slope.shape)
+    loss = linear_filter(
+        run, row_variances(levels, track.run), state_drift(names, levels, track.run.period),
+        whitened, width, gain, np.empty(run.correction.shape), np.empty((0, len(names), len(names))),
+    )  # fmt: skip
+    gains = Gains(track.gains.slope, gain, width)
+    return dataclasses.replace(track, levels=levels, loss=loss, whitened=whitened, gains=gains)
+
+
+def _scaled(levels: Levels, scale: float) -> Levels:
+    return dataclasses.replace(levels, sizes=scale * levels.sizes)
+
+
+# -- refinement -------------------------------------------------------------------------------------------------------
+
+
+def best_extension(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> Model | None:
+    """Refine the best proposals and return the model with the largest evidence.
+
+    Returns:
+        The model; None if no proposal brings the Bayes factor that an effect must bring.
+    """
+    found = [refine(evidence, now, p) for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
+    found = [m for m in found if m is not None and now.score - m.score > MIN_LOG_BAYES_FACTOR]
+    return min(found, key=lambda m: m.score, default=None)
+
+
+def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
+    """Fit a proposal beside a model, re-estimate the noise levels, and compute the evidence.
+
+    Args:
+        evidence: whose base is the model; it is the base afterwards, too.
+        now: the model.
+        proposal: what is added.
+
+    Returns:
+        The extended model; None where the machine cannot follow the runs.
+    """
+    guess = extend(evidence.data.machine, now.guess, proposal)
+    tracks = tuple(scale_residual_inputs(t, proposal.residual_scale) for t in now.judged.tracks)
+    evidence.set_base(Judged(now.guess, tracks, now.judged.loss))
+    try:
+        kept = None
+        if proposal.parameter_scale > 0.0:
+            kept = evidence.slopes(guess, evidence.errors(guess, MIDDLE), step=MIDDLE)
+        fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
+        if not np.isfinite(fit.loss):
+            return None
+        evidence.set_base(now.judged)
+        if proposal.residual_scale == 1.0:
+            judged = evidence.judged(fit.guess)
+        else:
+            judged = evidence.judged_from(fit.guess, tracks[0].levels)
+    finally:
+        evidence.set_base(now.judged)
+    return Model(judged, fit, fit.whole_penalty) if np.isfinite(judged.loss) else None
+
+
+def extend(machine: Machine, guess: Guess, proposal: Proposal) -> Guess:
+    """Add a proposal to a model: its effect, and the uncertain parameters if it needs them."""
+    if proposal.version:
+        guess = guess.plus(proposal.version.hypothesis, proposal.deviation)
+    has_calibration = any(h.name == CALIBRATION for h in guess.hypotheses)
+    if proposal.parameter_scale == 0.0 or has_calibration:
+        return guess
+    group = scaled_calibration(machine, guess, proposal.parameter_scale)
+    return guess.plus(group, np.zeros(group.size)) if group.size else guess
+
+
+def scaled_calibration(machine: Machine, guess: Guess, scale: float) -> Hypothesis:
+    """Return the uncertain parameters as one group, without those of the effects that are there.
+
+    Args:
+        machine: the given machine.
+        guess: the effects.
+        scale: standard deviation relative to what the machine file states.
+    """
+    names = frozenset(n for n, h in zip(guess.names, _owners(guess), strict=True) if h != CALIBRATION)
+    group = calibration(machine, names)
+    table = {k: dataclasses.replace(p, prior_std=scale * p.prior_std) for k, p in group.parameters.items()}
+    return dataclasses.replace(group, parameters=table)
+
+
+# -- removal and exchange ---------------------------------------------------------------------------------------------
+
+
+def without_part(evidence: Evidence, given: Model, now: Model, index: int) -> Model:
+    """Return a model without one of its effects, fitted again; the larger model is the base afterwards."""
+    guess = now.guess.without(index)
+    if not guess.parts:
+        return given
+    evidence.set_base(now.judged)
+    rest = settle(evidence, Model(evidence.judged(guess, reopened=True)))
+    evidence.set_base(now.judged)
+    return rest
+
+
+def remove_needless(evidence: Evidence, given: Model, now: Model) -> tuple[Model, list[Model]]:
+    """Remove effects, the weakest first, as long as that costs less than the smallest Bayes factor.
+
+    Returns:
+        The model, and for each of its parts the model without it.
+    """
+    while True:
+        rests = [without_part(evidence, given, now, k) for k in range(len(now.guess.parts))]
+        costs = [rest.score - now.score for rest in rests]
+        if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
+            return now, rests
+        now = rests[int(np.argmin(costs))]
+
+
+def exchange(
+    evidence: Evidence, given: Model, now: Model, rests: Sequence[Model], candidates: Sequence[Hypothesis]
+) -> tuple[Model, list[Model], tuple[tuple[Rival, ...], ...]]:
+    """Compare each effect with what else could stand in its place; a better rival replaces it.
+
+    Returns:
+        The model, for each part the model without it, and for each part its rivals.
+    """
+    rivals: list[tuple[Rival, ...]] = []
+    exchanged = False
+    for index, (hypothesis, _) in enumerate(now.guess.parts):
+        rest = rests[index]
+        if hypothesis.name == CALIBRATION:
+            rivals.append(())
+            continue
+        evidence.set_base(rest.judged)
+        taken = {h.key for h in now.guess.hypotheses}
+        proposals = [p for p in propose(evidence, rest, candidates) if p.version and p.key not in taken]
+        models = [refine(evidence, rest, p) for p in proposals[:_RIVALS] if p.factor > 0.0]
+        models = [settle(evidence, m) for m in models if m and m.score < rest.score]
+        best = min(models, key=lambda m: m.score, default=None)
+        if best is not None and best.score < now.score and not exchanged:
+            others = [m for m in models if m is not best] + [now]
+            now, exchanged = best, True
+            rivals.append(tuple(_rival(m, hypothesis) for m in others))
+        else:
+            rivals.append(tuple(_rival(m, hypothesis) for m in models))
+    return now, list(rests), tuple(rivals)
+
+
+def _rival(model: Model, replaced: Hypothesis) -> Rival:
+    hypothesis = next(
+        (h for h in reversed(model.guess.hypotheses) if h.name != CALIBRATION), replaced
+    )
+    assert model.fit
+    index = [h.key for h in model.guess.hypotheses].index(hypothesis.key)
+    charge = occam_penalty(moved_last(model.fit.information, model.guess, index), hypothesis.size)
+    return Rival(hypothesis, model.judged, charge, model.fit)
