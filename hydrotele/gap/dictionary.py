@@ -12,7 +12,7 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
-from hydrotele.estimate.track import COARSE
+from hydrotele.estimate.track import COARSE, Track
 
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed: a small one and two large ones."""
@@ -100,7 +100,7 @@ class Dictionary:
 
 
 def build_dictionary(
-    evidence: Evidence, guess: Guess, versions: Sequence[Version], uncertain: Hypothesis
+    evidence: Evidence, guess: Guess, versions: Sequence[Version], uncertain: Hypothesis, tracks: Sequence[Track]
 ) -> Dictionary:
     """Compute the columns of versions and of the uncertain parameters.
 
@@ -109,14 +109,15 @@ def build_dictionary(
         guess: that model; its own parameters are nuisance, too.
         versions: of the effects to add.
         uncertain: the uncertain parameters together.
+        tracks: of the base, or the first rows of them.
 
     Returns:
         The columns; versions that the model cannot follow are left out.
     """
-    base = evidence.errors(guess, COARSE)
+    base = evidence.errors(guess, COARSE, tracks)
 
     def difference(moved: Guess, length: float) -> np.ndarray:
-        return ((evidence.errors(moved, COARSE) - base) / length).astype(np.float32)
+        return ((evidence.errors(moved, COARSE, tracks) - base) / length).astype(np.float32)
 
     def of_version(version: Version) -> np.ndarray:
         columns = zip(version.steps.T, version.lengths, strict=True)

@@ -13,6 +13,7 @@ from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
+from hydrotele.gap.answer import answer_document
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import (
     FreeCalibration,
@@ -22,6 +23,7 @@ from hydrotele.gap.calibrating import (
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.model_search import search_model
 from hydrotele.gap.residuals import (
     believed,
     believed_part,
@@ -42,6 +44,7 @@ from hydrotele.gap.result import (
     GapSize,
     Lack,
     LearnedLaw,
+    Method,
     NamedEffect,
     Prediction,
     Verdict,
@@ -87,6 +90,7 @@ def find_gap(
     progress: Progress | None = None,
     effects: Sequence[str] = (),
     jobs: int = 2,
+    method: Method = "search",
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -96,10 +100,12 @@ def find_gap(
         effects: names of the effects to try; all if empty. If some are named, no law is learned
             and free runs calibrate nothing: what is lacking may be an effect that was not tried.
         jobs: processors that it may use.
+        method: `search`, or `regression` of `gap.model_search`.
 
     Returns:
         The gap, named or not.
     """
+    find = search_model if method == "regression" else search
     begin = time.perf_counter()
     tell = progress or (lambda text, share: None)
     given, notes = data.machine, []
@@ -111,7 +117,7 @@ def find_gap(
     data = downsample(select_exciting_segments(data))
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     try:
-        found = search(evidence, candidates, progress)
+        found = find(evidence, candidates, progress)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
@@ -200,6 +206,7 @@ def find_gap(
         notes=(*data.notes, *notes, *map(detail_words, details),
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
+        answers=tuple(answer_document(named)) if method == "regression" else None,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 

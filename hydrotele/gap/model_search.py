@@ -20,7 +20,7 @@ from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_pen
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run
-from hydrotele.estimate.track import STARTLE, Levels, Track, by_kind, row_variances, state_drift
+from hydrotele.estimate.track import STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary, list_versions
 from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns
@@ -36,12 +36,14 @@ RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
-_TRIED = 5  # candidates that are refined in each round
+_SECONDS = 16.0  # s of each run that the linear step uses; the refinement uses all
+_TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
+_CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
 _KEPT = 50  # effects that are linearised again after the first round
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
-_MAX_NOISE_ROUNDS = 6  # of the estimation of the noise levels
+_MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
 _UNEXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
 Progress = Callable[[str, float], None]
 
@@ -72,13 +74,27 @@ class Model:
 
 
 @dataclass(frozen=True)
+class Round:
+    """A round of the search: the model before and after, and the other refined models."""
+
+    before: Model
+    after: Model
+    others: tuple[Model, ...]
+
+
+def keys_of(model: Model) -> set[tuple[str, str]]:
+    """Return names and locations of the effects of a model."""
+    return {h.key for h in model.guess.hypotheses}
+
+
+@dataclass(frozen=True)
 class Proposal:
     """An effect, the calibration, or both, as the linear regression proposes it.
 
     Attributes:
         version: the effect; None for the calibration alone.
         deviation: (p,) where to start.
-        factor: twice its log Bayes factor.
+        factor: twice its log Bayes factor, extrapolated from the rows of the linear step to all rows.
         residual_scale: size of the residual inputs at which it explains the data best.
         parameter_scale: standard deviation of the uncertain parameters beside it.
     """
@@ -112,6 +128,7 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     candidates = timed([c for c in candidates if c.name not in _UNEXCLUDED], given.judged)
     now, first = given, tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
+    rounds: list[Round] = []
     for index in range(_MAX_EFFECTS):
         share = 0.05 + 0.8 * index / _MAX_EFFECTS
         tell(f"compare effects{_words(now)}", share)
@@ -120,14 +137,17 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         first = first or tuple(proposals)
         keys = keys or {p.key for p in proposals[:_KEPT]}
         tell(f"refine the best effects{_words(now)}", share + 0.03)
-        better = best_extension(evidence, now, proposals)
-        if better is None:
+        models = extensions(evidence, now, proposals)
+        better = min(models, key=lambda m: m.score, default=now)
+        if now.score - better.score < MIN_LOG_BAYES_FACTOR:
             break
-        now = settle(evidence, better)
+        settled = settle(evidence, better)
+        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        now = settled
     tell("remove unnecessary effects", 0.87)
-    now, rests = remove_needless(evidence, given, now)
+    now, rests = remove_needless(evidence, given, now, rounds)
     tell("compare alternative effects", 0.9)
-    now, rests, rivals = exchange(evidence, given, now, rests, candidates)
+    now, rests, rivals = exchange(evidence, now, rests, rounds)
     evidence.set_base(now.judged)
     charges = tuple(
         occam_penalty(moved_last(now.fit.information, now.guess, k), h.size) if now.fit else 0.0
@@ -189,28 +209,35 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     machine = evidence.data.machine
     names = frozenset(n for n, h in zip(now.guess.names, _owners(now.guess), strict=True) if h != CALIBRATION)
     uncertain = Hypothesis(CALIBRATION, "all", {}) if (CALIBRATION, "all") in taken else calibration(machine, names)
-    table = build_dictionary(evidence, now.guess, versions, uncertain)
+    tracks = [_first_seconds(track) for track in evidence.tracks]
+    table = build_dictionary(evidence, now.guess, versions, uncertain, tracks)
+    fraction = sum(len(t.whitened) for t in tracks) / sum(len(t.whitened) for t in evidence.tracks)
     best: dict[tuple[str, str], Proposal] = {}
-    start = min(sum(track.loss for track in evidence.tracks), np.inf)
-    reference = None
+    start = None
     for residual_scale in RESIDUAL_SCALES:
-        terms, loss = _normal_equations(evidence, now, table, residual_scale)
+        terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
         for parameter_scale in PARAMETER_SCALES:
             if parameter_scale > 0.0 and table.own.all():
                 continue
             scales = np.where(table.own, _OWN_SCALE, parameter_scale)
             marginal = terms.marginalise(scales)
             total = loss - terms.squares + marginal.loss
-            if reference is None:
-                reference, start = total, total
-            calibrated = Proposal(None, np.zeros(0), start - total, residual_scale, parameter_scale)
+            start = total if start is None else start
+            gained = (start - total) / fraction
+            calibrated = Proposal(None, np.zeros(0), gained, residual_scale, parameter_scale)
             if parameter_scale > 0.0:
                 _keep(best, calibrated)
             factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
             for version, factor, mean in zip(table.versions, factors, means, strict=True):
-                gained = start - total + float(factor)
-                _keep(best, Proposal(version, version.deviation(mean), gained, residual_scale, parameter_scale))
+                whole = gained + float(factor) / fraction
+                _keep(best, Proposal(version, version.deviation(mean), whole, residual_scale, parameter_scale))
     return sorted(best.values(), key=lambda p: -p.factor)
+
+
+def _first_seconds(track: Track) -> Track:
+    """Return the first seconds of a linearised track, with its transition Jacobians."""
+    rows = round(_SECONDS / track.run.period)
+    return dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
 
 
 def _owners(guess: Guess) -> list[str]:
@@ -223,14 +250,14 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> None:
 
 
 def _normal_equations(
-    evidence: Evidence, now: Model, table: Dictionary, residual_scale: float
+    evidence: Evidence, tracks: Sequence[Track], table: Dictionary, residual_scale: float
 ) -> tuple[NormalEquations, float]:
     """Normal equations with the residual inputs scaled, and -2 log likelihood of the errors there."""
-    edges = np.cumsum([0, *(len(t.whitened.ravel()) for t in evidence.tracks)])
+    edges = np.cumsum([0, *(t.whitened.size for t in tracks)])
     widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
 
     def of_run(index: int) -> tuple[NormalEquations, float]:
-        track, rows = evidence.tracks[index], slice(edges[index], edges[index + 1])
+        track, rows = tracks[index], slice(edges[index], edges[index + 1])
         scaled = scale_residual_inputs(track, residual_scale)
         columns = np.hstack([*(c[rows] for c in table.columns), table.nuisance[rows]]).astype(float)
         missing = ~np.isfinite(track.whitened)
@@ -245,7 +272,7 @@ def _normal_equations(
         errors = -np.nan_to_num(scaled.whitened).ravel()
         return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
 
-    found = evidence.map(of_run, range(len(evidence.tracks)))
+    found = evidence.map(of_run, range(len(tracks)))
     terms = found[0][0]
     for other, _ in found[1:]:
         terms = terms + other
@@ -284,15 +311,10 @@ def _scaled(levels: Levels, scale: float) -> Levels:
 # -- refinement -------------------------------------------------------------------------------------------------------
 
 
-def best_extension(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> Model | None:
-    """Refine the best proposals and return the model with the largest evidence.
-
-    Returns:
-        The model; None if no proposal brings the Bayes factor that an effect must bring.
-    """
-    found = [refine(evidence, now, p) for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
-    found = [m for m in found if m is not None and now.score - m.score > MIN_LOG_BAYES_FACTOR]
-    return min(found, key=lambda m: m.score, default=None)
+def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
+    """Refine the best proposals that the linear step holds for better than the model."""
+    chosen = [p for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
+    return [m for m in (refine(evidence, now, p) for p in chosen) if m is not None]
 
 
 def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
@@ -354,25 +376,30 @@ def scaled_calibration(machine: Machine, guess: Guess, scale: float) -> Hypothes
 # -- removal and exchange ---------------------------------------------------------------------------------------------
 
 
-def without_part(evidence: Evidence, given: Model, now: Model, index: int) -> Model:
+def without_part(evidence: Evidence, given: Model, now: Model, index: int, rounds: Sequence[Round]) -> Model:
     """Return a model without one of its effects, fitted again; the larger model is the base afterwards."""
     guess = now.guess.without(index)
     if not guess.parts:
         return given
+    for known in rounds:
+        if keys_of(known.before) == {h.key for h in guess.hypotheses}:
+            return known.before
     evidence.set_base(now.judged)
     rest = settle(evidence, Model(evidence.judged(guess, reopened=True)))
     evidence.set_base(now.judged)
     return rest
 
 
-def remove_needless(evidence: Evidence, given: Model, now: Model) -> tuple[Model, list[Model]]:
+def remove_needless(
+    evidence: Evidence, given: Model, now: Model, rounds: Sequence[Round]
+) -> tuple[Model, list[Model]]:  # fmt: skip
     """Remove effects, the weakest first, as long as that costs less than the smallest Bayes factor.
 
     Returns:
         The model, and for each of its parts the model without it.
     """
     while True:
-        rests = [without_part(evidence, given, now, k) for k in range(len(now.guess.parts))]
+        rests = [without_part(evidence, given, now, k, rounds) for k in range(len(now.guess.parts))]
         costs = [rest.score - now.score for rest in rests]
         if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
             return now, rests
@@ -380,40 +407,53 @@ def remove_needless(evidence: Evidence, given: Model, now: Model) -> tuple[Model
 
 
 def exchange(
-    evidence: Evidence, given: Model, now: Model, rests: Sequence[Model], candidates: Sequence[Hypothesis]
+    evidence: Evidence, now: Model, rests: Sequence[Model], rounds: Sequence[Round]
 ) -> tuple[Model, list[Model], tuple[tuple[Rival, ...], ...]]:
-    """Compare each effect with what else could stand in its place; a better rival replaces it.
+    """Compare each effect with what was refined in its place; a better rival replaces it.
 
     Returns:
         The model, for each part the model without it, and for each part its rivals.
     """
     rivals: list[tuple[Rival, ...]] = []
-    exchanged = False
+    order, best = list(range(len(rests))), now
     for index, (hypothesis, _) in enumerate(now.guess.parts):
-        rest = rests[index]
-        if hypothesis.name == CALIBRATION:
+        origin = next((r for r in rounds if hypothesis.key in keys_of(r.after) - keys_of(r.before)), None)
+        if hypothesis.name == CALIBRATION or origin is None:
             rivals.append(())
             continue
-        evidence.set_base(rest.judged)
-        taken = {h.key for h in now.guess.hypotheses}
-        proposals = [p for p in propose(evidence, rest, candidates) if p.version and p.key not in taken]
-        models = [refine(evidence, rest, p) for p in proposals[:_RIVALS] if p.factor > 0.0]
-        models = [settle(evidence, m) for m in models if m and m.score < rest.score]
-        best = min(models, key=lambda m: m.score, default=None)
-        if best is not None and best.score < now.score and not exchanged:
-            others = [m for m in models if m is not best] + [now]
-            now, exchanged = best, True
-            rivals.append(tuple(_rival(m, hypothesis) for m in others))
-        else:
-            rivals.append(tuple(_rival(m, hypothesis) for m in models))
-    return now, list(rests), tuple(rivals)
+        rest, taken = rests[index], keys_of(now)
+        models = [
+            model if keys_of(origin.before) == keys_of(rest) else _beside(evidence, rest, origin, model)
+            for model in origin.others if not keys_of(model) - keys_of(origin.before) & taken
+        ]  # fmt: skip
+        models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
+        models = [settle(evidence, m) if m.score < now.score + _CLOSE else m for m in models]
+        same_size = [m for m in models if len(m.guess.parts) == len(rests)]
+        if best is now and same_size and same_size[0].score < now.score:
+            best = same_size[0]
+            models = [now, *(m for m in models if m is not best)]
+            order = [*(k for k in order if k != index), index]  # the effect added last is the last part
+        rivals.append(tuple(_rival(m, rest) for m in models))
+    return best, [rests[k] for k in order], tuple(rivals[k] for k in order)
 
 
-def _rival(model: Model, replaced: Hypothesis) -> Rival:
-    hypothesis = next(
-        (h for h in reversed(model.guess.hypotheses) if h.name != CALIBRATION), replaced
-    )
+def _beside(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
+    """Return a rival beside the rest of the model, fitted again."""
+    old = keys_of(origin.before)
+    guess = rest.guess
+    for hypothesis, deviation in model.guess.parts:
+        if hypothesis.key not in old | keys_of(rest):
+            guess = guess.plus(hypothesis, deviation)
+    evidence.set_base(rest.judged)
+    fit = evidence.fit(guess, 0.0, steps=2, step=MIDDLE)
+    return Model(evidence.judged(fit.guess), fit, fit.whole_penalty)
+
+
+def _rival(model: Model, rest: Model) -> Rival:
+    """Describe a model by the effect that it has in addition to the rest."""
+    keys = [h.key for h in model.guess.hypotheses]
+    index = next((k for k, key in enumerate(keys) if key not in keys_of(rest) and key[0] != CALIBRATION), len(keys) - 1)
+    hypothesis = model.guess.hypotheses[index]
     assert model.fit
-    index = [h.key for h in model.guess.hypotheses].index(hypothesis.key)
     charge = occam_penalty(moved_last(model.fit.information, model.guess, index), hypothesis.size)
     return Rival(hypothesis, model.judged, charge, model.fit)
