@@ -15,7 +15,8 @@ from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.track import COARSE, Track
 
 AMPLITUDES = (0.3, 2.0, -2.0)
-"""Parameter changes [prior standard deviations] at which columns are formed: a small one and two large ones."""
+"""Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one
+parameter and without start values of their own."""
 _MIN_AMPLITUDE = 0.05  # prior standard deviations; a bound that is nearer leaves no room for a difference
 _START_RANGE = (0.3, 3.0)  # multiples of a version's amplitude within which the first refinement starts
 
@@ -58,7 +59,7 @@ def list_versions(hypothesis: Hypothesis) -> list[Version]:
     starts = [s for s in hypothesis.starts if np.any(s)]
     for start in starts:
         found.append(Version(hypothesis, start[:, None].astype(float)))
-    for amplitude in AMPLITUDES[: 1 if starts else None]:
+    for amplitude in AMPLITUDES[: 1 if starts or hypothesis.size > 1 else None]:
         steps = [_room(hypothesis, k, amplitude) for k in range(hypothesis.size)]
         if all(abs(step) >= _MIN_AMPLITUDE for step in steps):
             found.append(Version(hypothesis, np.diag(steps)))

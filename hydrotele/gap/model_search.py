@@ -36,7 +36,7 @@ RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
-_SECONDS = 16.0  # s of each run that the linear step uses; the refinement uses all
+_SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
 _CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
@@ -89,14 +89,14 @@ def keys_of(model: Model) -> set[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An effect, the calibration, or both, as the linear regression proposes it.
+    """An effect or the calibration, as the linear regression proposes it.
 
     Attributes:
         version: the effect; None for the calibration alone.
         deviation: (p,) where to start.
         factor: twice its log Bayes factor, extrapolated from the rows of the linear step to all rows.
         residual_scale: size of the residual inputs at which it explains the data best.
-        parameter_scale: standard deviation of the uncertain parameters beside it.
+        parameter_scale: standard deviation of the uncertain parameters; 0 of an effect.
     """
 
     version: Version | None
@@ -193,8 +193,9 @@ def _words(model: Model) -> str:
 def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
     """Rank effects by their Bayes factors in the linearised model.
 
-    For every size of the residual inputs and every scale of the uncertain parameters, the density of the errors
-    is known in closed form. A proposal has the largest one over both, and over the versions of its effect.
+    The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
+    the size and the version that make it largest; the calibration with the size and the scale of the uncertain
+    parameters that do.
 
     Args:
         evidence: whose base is the model.
@@ -213,31 +214,31 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     table = build_dictionary(evidence, now.guess, versions, uncertain, tracks)
     fraction = sum(len(t.whitened) for t in tracks) / sum(len(t.whitened) for t in evidence.tracks)
     best: dict[tuple[str, str], Proposal] = {}
-    start = None
+    has_calibration, start = (CALIBRATION, "all") in taken, None
     for residual_scale in RESIDUAL_SCALES:
         terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
-        for parameter_scale in PARAMETER_SCALES:
-            if parameter_scale > 0.0 and table.own.all():
-                continue
-            scales = np.where(table.own, _OWN_SCALE, parameter_scale)
-            marginal = terms.marginalise(scales)
+        for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration else None]:
+            marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
             total = loss - terms.squares + marginal.loss
             start = total if start is None else start
             gained = (start - total) / fraction
-            calibrated = Proposal(None, np.zeros(0), gained, residual_scale, parameter_scale)
             if parameter_scale > 0.0:
-                _keep(best, calibrated)
+                _keep(best, Proposal(None, np.zeros(0), gained, residual_scale, parameter_scale))
+                continue
             factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
             for version, factor, mean in zip(table.versions, factors, means, strict=True):
                 whole = gained + float(factor) / fraction
-                _keep(best, Proposal(version, version.deviation(mean), whole, residual_scale, parameter_scale))
+                _keep(best, Proposal(version, version.deviation(mean), whole, residual_scale, 0.0))
     return sorted(best.values(), key=lambda p: -p.factor)
 
 
 def _first_seconds(track: Track) -> Track:
     """Return the first seconds of a linearised track, with its transition Jacobians."""
     rows = round(_SECONDS / track.run.period)
-    return dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
+    first = dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
+    there = np.isfinite(first.whitened)
+    loss = float(np.sum(first.whitened[there] ** 2 + 2.0 * np.log(first.gains.spread[there])))
+    return dataclasses.replace(first, loss=loss)
 
 
 def _owners(guess: Guess) -> list[str]:
@@ -349,12 +350,9 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
 
 
 def extend(machine: Machine, guess: Guess, proposal: Proposal) -> Guess:
-    """Add a proposal to a model: its effect, and the uncertain parameters if it needs them."""
+    """Add a proposal to a model: its effect, or the uncertain parameters."""
     if proposal.version:
-        guess = guess.plus(proposal.version.hypothesis, proposal.deviation)
-    has_calibration = any(h.name == CALIBRATION for h in guess.hypotheses)
-    if proposal.parameter_scale == 0.0 or has_calibration:
-        return guess
+        return guess.plus(proposal.version.hypothesis, proposal.deviation)
     group = scaled_calibration(machine, guess, proposal.parameter_scale)
     return guess.plus(group, np.zeros(group.size)) if group.size else guess
 
