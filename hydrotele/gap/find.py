@@ -24,6 +24,7 @@ from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.model_search import search_model
+from hydrotele.gap.profiles import find_profiles, profile_words
 from hydrotele.gap.residuals import (
     believed,
     believed_part,
@@ -151,6 +152,7 @@ def find_gap(
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         spread = standard_deviations(evidence, told.guess, scatter)
+        profiles = [profile_words(p) for p in find_profiles(evidence, told)] if method == "regression" else []
         shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
@@ -203,7 +205,7 @@ def find_gap(
         lacks=lacks,
         noise=_noise(data, judge.levels),
         jitter=jitter,
-        notes=(*data.notes, *notes, *map(detail_words, details),
+        notes=(*data.notes, *notes, *map(detail_words, details), *profiles,
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
         answers=tuple(answer_document(named)) if method == "regression" else None,

@@ -22,8 +22,9 @@ from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibr
 from hydrotele.estimate.levels import linear_filter, linear_run
 from hydrotele.estimate.track import STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
-from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary, list_versions
-from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns
+from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
+from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
+from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Rival, moved_last
 from hydrotele.gap.screening import Screened, timed
 from hydrotele.gap.search import Found
@@ -37,6 +38,8 @@ PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
 _SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
+_JOINT = 40  # best effects among which a pair is looked for
+_COMPONENTS = 4  # of the sum of single effects
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
 _CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
@@ -89,26 +92,24 @@ def keys_of(model: Model) -> set[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class Proposal:
-    """An effect or the calibration, as the linear regression proposes it.
+    """One effect, a pair of effects, or the calibration, as the linear regression proposes it.
 
     Attributes:
-        version: the effect; None for the calibration alone.
-        deviation: (p,) where to start.
+        parts: the effects and the deviations (p,) at which to start; empty for the calibration.
         factor: twice its log Bayes factor, extrapolated from the rows of the linear step to all rows.
         residual_scale: size of the residual inputs at which it explains the data best.
         parameter_scale: standard deviation of the uncertain parameters; 0 of an effect.
     """
 
-    version: Version | None
-    deviation: np.ndarray
+    parts: tuple[tuple[Hypothesis, np.ndarray], ...]
     factor: float
     residual_scale: float
-    parameter_scale: float
+    parameter_scale: float = 0.0
 
     @property
     def key(self) -> tuple[str, str]:
-        """Name and location."""
-        return self.version.hypothesis.key if self.version else (CALIBRATION, "all")
+        """Name and location of the first effect."""
+        return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
 
 
 def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
@@ -138,8 +139,10 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         keys = keys or {p.key for p in proposals[:_KEPT]}
         tell(f"refine the best effects{_words(now)}", share + 0.03)
         models = extensions(evidence, now, proposals)
-        better = min(models, key=lambda m: m.score, default=now)
-        if now.score - better.score < MIN_LOG_BAYES_FACTOR:
+        better = min(models, key=lambda m: m.score + MIN_LOG_BAYES_FACTOR * len(m.guess.parts), default=now)
+        if better is now or now.score - better.score < MIN_LOG_BAYES_FACTOR * (
+            len(better.guess.parts) - len(now.guess.parts)
+        ):
             break
         settled = settle(evidence, better)
         rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
@@ -157,8 +160,8 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         None if h.name == CALIBRATION else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
     )
     ranking = tuple(
-        Screened(p.version.hypothesis, p.factor, p.factor, p.deviation)
-        for p in first if p.version and p.factor > 0.0
+        Screened(p.parts[0][0], p.factor, p.factor, p.parts[0][1])
+        for p in first if len(p.parts) == 1 and p.factor > 0.0
     )  # fmt: skip
     return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
 
@@ -203,7 +206,7 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
         candidates: effects that may be added.
 
     Returns:
-        One proposal per effect, and one of the calibration alone, the best first.
+        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first.
     """
     taken = {h.key for h in now.guess.hypotheses}
     versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
@@ -214,6 +217,8 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     table = build_dictionary(evidence, now.guess, versions, uncertain, tracks)
     fraction = sum(len(t.whitened) for t in tracks) / sum(len(t.whitened) for t in evidence.tracks)
     best: dict[tuple[str, str], Proposal] = {}
+    chosen: dict[tuple[str, str], int] = {}
+    gains: dict[float, float] = {}
     has_calibration, start = (CALIBRATION, "all") in taken, None
     for residual_scale in RESIDUAL_SCALES:
         terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
@@ -223,13 +228,58 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
             start = total if start is None else start
             gained = (start - total) / fraction
             if parameter_scale > 0.0:
-                _keep(best, Proposal(None, np.zeros(0), gained, residual_scale, parameter_scale))
+                _keep(best, Proposal((), gained, residual_scale, parameter_scale))
                 continue
             factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
-            for version, factor, mean in zip(table.versions, factors, means, strict=True):
-                whole = gained + float(factor) / fraction
-                _keep(best, Proposal(version, version.deviation(mean), whole, residual_scale, 0.0))
-    return sorted(best.values(), key=lambda p: -p.factor)
+            gains[residual_scale] = gained
+            for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
+                part = version.hypothesis, version.deviation(mean)
+                proposal = Proposal((part,), gained + float(factor) / fraction, residual_scale)
+                if _keep(best, proposal):
+                    chosen[proposal.key] = index
+    ranked = sorted(best.values(), key=lambda p: -p.factor)
+    single = [p for p in ranked if p.parts]
+    if not single:
+        return ranked
+    scale = single[0].residual_scale
+    kept = table.select([chosen[p.key] for p in single[:_JOINT]])
+    pair = propose_pair(evidence, tracks, kept, scale)
+    if pair is None:
+        return ranked
+    return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked]
+
+
+def propose_pair(
+    evidence: Evidence, tracks: Sequence[Track], table: Dictionary, residual_scale: float
+) -> tuple[tuple[tuple[Hypothesis, np.ndarray], ...], float] | None:
+    """Propose two effects that act together, by a sum of single effects.
+
+    Args:
+        evidence: whose base is the model.
+        tracks: of the base, or the first rows of them.
+        table: one version of each of the best effects.
+        residual_scale: size of the residual inputs.
+
+    Returns:
+        The effects with their deviations, and twice the log Bayes factor of both together; None if fewer than two
+        components prefer an effect.
+    """
+    joint = dataclasses.replace(table, columns=(np.hstack(table.columns),))
+    terms, _ = _normal_equations(evidence, tracks, joint, residual_scale)
+    marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, 0.0))
+    edges = np.cumsum([0, *(c.shape[1] for c in table.columns)])
+    gram = marginal.blocks[0]
+    chances, _ = sum_of_single_effects(gram, marginal.right, edges, _COMPONENTS)
+    leaders = list(dict.fromkeys(int(row[:-1].argmax()) for row in chances if row[:-1].max() > LIKELY))[:2]
+    if len(leaders) < 2:
+        return None
+    own = np.concatenate([np.arange(edges[g], edges[g + 1]) for g in leaders])
+    width = np.array([0, len(own)])
+    factors, (mean,) = compare_groups(width, marginal.right[own], [gram[np.ix_(own, own)]])
+    split = np.split(mean, [edges[leaders[0] + 1] - edges[leaders[0]]])
+    versions = [table.versions[g] for g in leaders]
+    parts = tuple((v.hypothesis, v.deviation(m)) for v, m in zip(versions, split, strict=True))
+    return parts, float(factors[0])
 
 
 def _first_seconds(track: Track) -> Track:
@@ -245,9 +295,12 @@ def _owners(guess: Guess) -> list[str]:
     return [h.name for h in guess.hypotheses for _ in h.parameters]
 
 
-def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> None:
-    if proposal.key not in best or proposal.factor > best[proposal.key].factor:
-        best[proposal.key] = proposal
+def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
+    """Keep a proposal if it is the best one of its effect; return whether it is."""
+    if proposal.key in best and proposal.factor <= best[proposal.key].factor:
+        return False
+    best[proposal.key] = proposal
+    return True
 
 
 def _normal_equations(
@@ -350,9 +403,9 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
 
 
 def extend(machine: Machine, guess: Guess, proposal: Proposal) -> Guess:
-    """Add a proposal to a model: its effect, or the uncertain parameters."""
-    if proposal.version:
-        return guess.plus(proposal.version.hypothesis, proposal.deviation)
+    """Add a proposal to a model: its effects, or the uncertain parameters."""
+    if proposal.parts:
+        return Guess((*guess.parts, *proposal.parts))
     group = scaled_calibration(machine, guess, proposal.parameter_scale)
     return guess.plus(group, np.zeros(group.size)) if group.size else guess
 
