@@ -12,6 +12,9 @@ from typing import Any
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.result import SURE, NamedEffect
 
+LEVELS = ("place", "family", "law")
+"""The levels of an answer, from the first to the deepest."""
+
 FAMILIES: Mapping[str, tuple[str, ...]] = {
     "friction": (
         "coulomb_friction", "viscous_friction", "stribeck_friction", "friction_asymmetry", "presliding",
@@ -120,3 +123,18 @@ def answer_document(effects: Sequence[NamedEffect]) -> list[dict[str, Any]]:
             "none": answer.none,
         })  # fmt: skip
     return documents
+
+
+def answer_words(effect: NamedEffect) -> str:
+    """Say which level is sure where the law is not; empty where it is.
+
+    >>> answer_words(NamedEffect("coulomb_friction", "boom", 0.97, {}))
+    ''
+    """
+    answer = answer_of(effect)
+    level = answer.level
+    if len(level) == len(LEVELS):
+        return ""
+    known = ", ".join(f"{kind} {name}" for kind, name in zip(LEVELS, level, strict=False)) or "not even the place"
+    laws = ", ".join(f"{e.name} {e.location} {100.0 * e.probability:.0f} %" for e in answer.explanations)
+    return f"Determined with at least {100.0 * SURE:.0f} %: {known}. Laws: {laws}."

@@ -13,7 +13,7 @@ from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
-from hydrotele.gap.answer import answer_document
+from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import (
     FreeCalibration,
@@ -152,7 +152,9 @@ def find_gap(
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         spread = standard_deviations(evidence, told.guess, scatter)
-        profiles = [profile_words(p) for p in find_profiles(evidence, told)] if method == "regression" else []
+        method_notes = []
+        if method == "regression":
+            method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
@@ -166,6 +168,8 @@ def find_gap(
     lacks = _lacks(data.machine, discovery.judged)
     perfect = not (failed or learned or lacks)
     named, details = without_details(named, failed, data.machine.axes, perfect)
+    if method == "regression":
+        method_notes += [words for effect in named if (words := answer_words(effect))]
     verdict = verdict_of(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -205,7 +209,7 @@ def find_gap(
         lacks=lacks,
         noise=_noise(data, judge.levels),
         jitter=jitter,
-        notes=(*data.notes, *notes, *map(detail_words, details), *profiles,
+        notes=(*data.notes, *notes, *map(detail_words, details), *method_notes,
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
         answers=tuple(answer_document(named)) if method == "regression" else None,

@@ -20,7 +20,7 @@ from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_pen
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run
-from hydrotele.estimate.track import STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
+from hydrotele.estimate.track import COARSE, STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
 from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
@@ -388,7 +388,7 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
     try:
         kept = None
         if proposal.parameter_scale > 0.0:
-            kept = evidence.slopes(guess, evidence.errors(guess, MIDDLE), step=MIDDLE)
+            kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE)
         fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
         if not np.isfinite(fit.loss):
             return None
