@@ -82,7 +82,11 @@ def search_case(case: Case, method: str, jobs: int) -> dict[str, Any]:
         shutil.copytree(case.logs, copy)
         data = load_dataset([copy], load_machine(case.machine))
         start = time.process_time()
-        gap = find_gap(data, jobs=jobs, method=method)
+
+        def tell(text: str, share: float) -> None:
+            print(f"{time.process_time() - start:6.0f} s {100 * share:3.0f} % {text}", file=sys.stderr, flush=True)
+
+        gap = find_gap(data, tell, jobs=jobs, method=method)
     return gap_document(gap) | {"processor_seconds": time.process_time() - start}
 
 
