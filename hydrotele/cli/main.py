@@ -10,7 +10,7 @@ import signal
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -317,6 +317,10 @@ def gap(
     mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
     force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
+    method: Annotated[
+        Literal["search", "regression"],
+        typer.Option(help="How effects are searched; regression is experimental."),
+    ] = "search",
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -330,7 +334,7 @@ def gap(
     model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
-                       "--force": force}  # fmt: skip
+                       "--force": force, "--method": method != "search"}  # fmt: skip
         if strange := [option for option, value in of_machines.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
@@ -338,7 +342,7 @@ def gap(
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
-        effect or [], jobs, force, mask,
+        effect or [], jobs, force, mask, method,
     )  # fmt: skip
 
 

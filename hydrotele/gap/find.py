@@ -14,6 +14,7 @@ from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
+from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import (
     FreeCalibration,
@@ -24,6 +25,8 @@ from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.interim import Interim, keep_better
+from hydrotele.gap.model_search import search_model
+from hydrotele.gap.profiles import find_profiles, profile_words
 from hydrotele.gap.residuals import (
     believed,
     believed_part,
@@ -44,6 +47,7 @@ from hydrotele.gap.result import (
     GapSize,
     Lack,
     LearnedLaw,
+    Method,
     NamedEffect,
     Prediction,
     Verdict,
@@ -90,6 +94,7 @@ def find_gap(
     effects: Sequence[str] = (),
     jobs: int = 2,
     keep: Callable[[Interim], None] | None = None,
+    method: Method = "search",
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -100,6 +105,7 @@ def find_gap(
             and free runs calibrate nothing: what is lacking may be an effect that was not tried.
         jobs: processors that it may use.
         keep: called with the best answer so far, each time that there is a better one.
+        method: `search`, or `regression` of `gap.model_search`.
 
     Returns:
         The gap, named or not.
@@ -108,6 +114,7 @@ def find_gap(
         CannotFollowError: the filter of the given machine cannot follow the readings.
         InputError: a custom effect allows no value, or its file raised an error.
     """
+    find = search_model if method == "regression" else search
     begin = time.perf_counter()
     tell = progress or (lambda text, share: None)
     given, notes = data.machine, []
@@ -125,7 +132,7 @@ def find_gap(
     if keep:
         evidence.keep = keep_better(data.machine, keep, begin)
     try:
-        found = search(evidence, candidates, progress)
+        found = find(evidence, candidates, progress)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
@@ -160,6 +167,9 @@ def find_gap(
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         spread = standard_deviations(evidence, told.guess, scatter)
+        method_notes = []
+        if method == "regression":
+            method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
     finally:
         evidence.close()
@@ -173,6 +183,8 @@ def find_gap(
     lacks = _lacks(data.machine, discovery.judged)
     perfect = not (failed or learned or lacks)
     named, details = without_details(named, failed, data.machine.axes, perfect)
+    if method == "regression":
+        method_notes += [words for effect in named if (words := answer_words(effect))]
     verdict = verdict_of(named, failed, None if judge.ripple else floor)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
@@ -212,9 +224,10 @@ def find_gap(
         lacks=lacks,
         noise=_noise(data, judge.levels),
         jitter=jitter,
-        notes=(*data.notes, *notes, *map(detail_words, details),
+        notes=(*data.notes, *notes, *map(detail_words, details), *method_notes,
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
+        answers=tuple(answer_document(named)) if method == "regression" else None,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 

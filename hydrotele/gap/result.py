@@ -21,6 +21,7 @@ SURE = 0.95
 LIKELY = 0.5
 """Probability above which an effect may explain a part: likelier than all else."""
 
+Method = Literal["search", "regression"]
 Verdict = Literal["named", "partly", "ambiguous", "unknown", "no_gap"]
 
 
@@ -257,6 +258,7 @@ class Gap(Generic[Model]):
         seconds: wall time of the search.
         open_loop: how far the models run away from the measured motion when the measured forces
             drive them: `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]); or None.
+        answers: per effect its hierarchical answer as of `gap.answer`; None where no method gives it.
     """
 
     machine: Model
@@ -281,6 +283,7 @@ class Gap(Generic[Model]):
     seconds: float = 0.0
     open_loop: Mapping[str, Any] | None = None
     unused_channels: tuple[str, ...] = ()
+    answers: tuple[Mapping[str, Any], ...] | None = None
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -314,6 +317,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `unused_channels`: logged channels that were not used, with the reason.
         Of a mechanism also `open_loop`: `horizon` [s], `before` and `after` (joint -> RMS [rad] or
         [m] by which a model runs away within it when the measured forces drive it), or null.
+        With the method `regression` also `answers`: per effect `sure` (the deepest of place, family and law that is
+        sure), and the probabilities of `places`, `families` there, `laws`, and `none`.
     """
     unknown = gap.unknown and {
         "law": gap.unknown.law,
@@ -325,7 +330,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
     size = gap.size
     laws = {law: {"unit": gap.law_units.get(law, "1"), "places": places} for law, places in gap.laws.items()}
     open_loop = {} if gap.open_loop is None else {"open_loop": gap.open_loop}
-    return finite(open_loop | {
+    answers = {} if gap.answers is None else {"answers": gap.answers}
+    return finite(open_loop | answers | {
         "verdict": gap.verdict,
         "effects": [effect_document(effect) for effect in gap.effects],
         "calibration": {

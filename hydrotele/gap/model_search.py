@@ -1,0 +1,510 @@
+"""The gap search as one model selection: add, exchange and remove effects by their log evidence.
+
+Every model is a set of effects with parameters, perhaps with the uncertain parameters of the machine file as one dense
+group. Its log evidence has noise levels and residual inputs re-estimated for it. `docs/gap_method.md` states the model.
+
+1. Linearise the whitened errors in every effect (`gap.dictionary`) and compare all of them by their Bayes factors,
+   maximised over the size of the residual inputs and the scale of the parameter uncertainty (`gap.regression`).
+2. Refine the best few, re-estimate their noise levels, and compare their evidence.
+3. Add the best one if its Bayes factor is large enough, and repeat.
+4. Remove every effect whose removal costs less than that; exchange an effect for a better rival.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
+from hydrotele.estimate.filter import Gains
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
+from hydrotele.estimate.levels import linear_filter, linear_run
+from hydrotele.estimate.track import COARSE, STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
+from hydrotele.gap.calibrating import fit_until_settled
+from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
+from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
+from hydrotele.gap.result import LIKELY
+from hydrotele.gap.rivals import Rival, moved_last
+from hydrotele.gap.screening import Screened, timed
+from hydrotele.gap.search import Found
+from hydrotele.machine.machine import Machine
+
+MIN_LOG_BAYES_FACTOR = 20.0
+"""Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
+RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
+"""Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
+PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
+"""Standard deviations of the uncertain parameters, relative to those that the machine file states."""
+_OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
+_SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
+_JOINT = 40  # best effects among which a pair is looked for
+_COMPONENTS = 4  # of the sum of single effects
+_TRIED = 4  # candidates that are refined in each round
+_RIVALS = 3  # candidates that are refined in the place of an accepted effect
+_CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
+_KEPT = 50  # effects that are linearised again after the first round
+_MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
+_SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
+_MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
+_UNEXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A set of effects with its evidence.
+
+    Attributes:
+        judged: the effects, fitted, with their own noise levels.
+        fit: their last fit; None without effects.
+        penalty: log determinant of the posterior precision of all parameters, prior included.
+    """
+
+    judged: Judged
+    fit: Fit | None = None
+    penalty: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """-2 log evidence, up to a constant."""
+        return self.judged.loss + self.penalty
+
+    @property
+    def guess(self) -> Guess:
+        """The effects and their parameters."""
+        return self.judged.guess
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round of the search: the model before and after, and the other refined models."""
+
+    before: Model
+    after: Model
+    others: tuple[Model, ...]
+
+
+def keys_of(model: Model) -> set[tuple[str, str]]:
+    """Return names and locations of the effects of a model."""
+    return {h.key for h in model.guess.hypotheses}
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One effect, a pair of effects, or the calibration, as the linear regression proposes it.
+
+    Attributes:
+        parts: the effects and the deviations (p,) at which to start; empty for the calibration.
+        factor: twice its log Bayes factor, extrapolated from the rows of the linear step to all rows.
+        residual_scale: size of the residual inputs at which it explains the data best.
+        parameter_scale: standard deviation of the uncertain parameters; 0 of an effect.
+    """
+
+    parts: tuple[tuple[Hypothesis, np.ndarray], ...]
+    factor: float
+    residual_scale: float
+    parameter_scale: float = 0.0
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and location of the first effect."""
+        return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
+
+
+def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
+    """Find the effects that the data ask for.
+
+    Args:
+        evidence: on the fit runs, with noise levels that it estimates.
+        candidates: the effects.
+        progress: called with (what is done, fraction done).
+
+    Returns:
+        The model, its rivals, and the first ranking.
+    """
+    tell = progress or (lambda text, share: None)
+    tell("estimate the noise levels of the given model", 0.0)
+    given = Model(settle_noise(evidence, evidence.judged(Guess())))
+    candidates = timed([c for c in candidates if c.name not in _UNEXCLUDED], given.judged)
+    now, first = given, tuple[Proposal, ...]()
+    keys: set[tuple[str, str]] | None = None
+    rounds: list[Round] = []
+    for index in range(_MAX_EFFECTS):
+        share = 0.05 + 0.8 * index / _MAX_EFFECTS
+        tell(f"compare effects{_words(now)}", share)
+        pool = [c for c in candidates if keys is None or c.key in keys]
+        proposals = propose(evidence, now, pool)
+        first = first or tuple(proposals)
+        keys = keys or {p.key for p in proposals[:_KEPT]}
+        tell(f"refine the best effects{_words(now)}", share + 0.03)
+        models = extensions(evidence, now, proposals)
+        better = min(models, key=lambda m: m.score + MIN_LOG_BAYES_FACTOR * len(m.guess.parts), default=now)
+        if better is now or now.score - better.score < MIN_LOG_BAYES_FACTOR * (
+            len(better.guess.parts) - len(now.guess.parts)
+        ):
+            break
+        settled = settle(evidence, better)
+        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        now = settled
+    tell("remove unnecessary effects", 0.87)
+    now, rests = remove_needless(evidence, given, now, rounds)
+    tell("compare alternative effects", 0.9)
+    now, rests, rivals = exchange(evidence, now, rests, rounds)
+    evidence.set_base(now.judged)
+    charges = tuple(
+        occam_penalty(moved_last(now.fit.information, now.guess, k), h.size) if now.fit else 0.0
+        for k, h in enumerate(now.guess.hypotheses)
+    )
+    without = tuple(
+        None if h.name == CALIBRATION else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
+    )
+    ranking = tuple(
+        Screened(p.parts[0][0], p.factor, p.factor, p.parts[0][1])
+        for p in first if len(p.parts) == 1 and p.factor > 0.0
+    )  # fmt: skip
+    return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
+
+
+def settle_noise(evidence: Evidence, judged: Judged) -> Judged:
+    """Re-estimate the noise levels of a model until its likelihood no longer changes; it becomes the base."""
+    for _ in range(_MAX_NOISE_ROUNDS):
+        evidence.set_base(judged)
+        again = evidence.judged(judged.guess, same=True)
+        if again.loss > judged.loss - _SETTLED:
+            break
+        judged = again
+    return evidence.set_base(judged)
+
+
+def settle(evidence: Evidence, model: Model) -> Model:
+    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base."""
+    if not model.guess.parts:
+        return Model(settle_noise(evidence, model.judged))
+    judged, fit = fit_until_settled(evidence, model.judged)
+    return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
+
+
+def _words(model: Model) -> str:
+    names = ", ".join(f"{h.name} {h.location}" for h in model.guess.hypotheses)
+    return f" beside {names}" if names else ""
+
+
+# -- linear step ------------------------------------------------------------------------------------------------------
+
+
+def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
+    """Rank effects by their Bayes factors in the linearised model.
+
+    The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
+    the size and the version that make it largest; the calibration with the size and the scale of the uncertain
+    parameters that do.
+
+    Args:
+        evidence: whose base is the model.
+        now: the model.
+        candidates: effects that may be added.
+
+    Returns:
+        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first.
+    """
+    taken = {h.key for h in now.guess.hypotheses}
+    versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
+    machine = evidence.data.machine
+    names = frozenset(n for n, h in zip(now.guess.names, _owners(now.guess), strict=True) if h != CALIBRATION)
+    uncertain = Hypothesis(CALIBRATION, "all", {}) if (CALIBRATION, "all") in taken else calibration(machine, names)
+    tracks = [_first_seconds(track) for track in evidence.tracks]
+    table = build_dictionary(evidence, now.guess, versions, uncertain, tracks)
+    fraction = sum(len(t.whitened) for t in tracks) / sum(len(t.whitened) for t in evidence.tracks)
+    best: dict[tuple[str, str], Proposal] = {}
+    chosen: dict[tuple[str, str], int] = {}
+    gains: dict[float, float] = {}
+    has_calibration, start = (CALIBRATION, "all") in taken, None
+    for residual_scale in RESIDUAL_SCALES:
+        terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
+        for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration else None]:
+            marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
+            total = loss - terms.squares + marginal.loss
+            start = total if start is None else start
+            gained = (start - total) / fraction
+            if parameter_scale > 0.0:
+                _keep(best, Proposal((), gained, residual_scale, parameter_scale))
+                continue
+            factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
+            gains[residual_scale] = gained
+            for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
+                part = version.hypothesis, version.deviation(mean)
+                proposal = Proposal((part,), gained + float(factor) / fraction, residual_scale)
+                if _keep(best, proposal):
+                    chosen[proposal.key] = index
+    ranked = sorted(best.values(), key=lambda p: -p.factor)
+    single = [p for p in ranked if p.parts]
+    if not single:
+        return ranked
+    scale = single[0].residual_scale
+    kept = table.select([chosen[p.key] for p in single[:_JOINT]])
+    pair = propose_pair(evidence, tracks, kept, scale)
+    if pair is None:
+        return ranked
+    return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked]
+
+
+def propose_pair(
+    evidence: Evidence, tracks: Sequence[Track], table: Dictionary, residual_scale: float
+) -> tuple[tuple[tuple[Hypothesis, np.ndarray], ...], float] | None:
+    """Propose two effects that act together, by a sum of single effects.
+
+    Args:
+        evidence: whose base is the model.
+        tracks: of the base, or the first rows of them.
+        table: one version of each of the best effects.
+        residual_scale: size of the residual inputs.
+
+    Returns:
+        The effects with their deviations, and twice the log Bayes factor of both together; None if fewer than two
+        components prefer an effect.
+    """
+    joint = dataclasses.replace(table, columns=(np.hstack(table.columns),))
+    terms, _ = _normal_equations(evidence, tracks, joint, residual_scale)
+    marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, 0.0))
+    edges = np.cumsum([0, *(c.shape[1] for c in table.columns)])
+    gram = marginal.blocks[0]
+    chances, _ = sum_of_single_effects(gram, marginal.right, edges, _COMPONENTS)
+    leaders = list(dict.fromkeys(int(row[:-1].argmax()) for row in chances if row[:-1].max() > LIKELY))[:2]
+    if len(leaders) < 2:
+        return None
+    own = np.concatenate([np.arange(edges[g], edges[g + 1]) for g in leaders])
+    width = np.array([0, len(own)])
+    factors, (mean,) = compare_groups(width, marginal.right[own], [gram[np.ix_(own, own)]])
+    split = np.split(mean, [edges[leaders[0] + 1] - edges[leaders[0]]])
+    versions = [table.versions[g] for g in leaders]
+    parts = tuple((v.hypothesis, v.deviation(m)) for v, m in zip(versions, split, strict=True))
+    return parts, float(factors[0])
+
+
+def _first_seconds(track: Track) -> Track:
+    """Return the first seconds of a linearised track, with its transition Jacobians."""
+    rows = round(_SECONDS / track.run.period)
+    first = dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
+    there = np.isfinite(first.whitened)
+    loss = float(np.sum(first.whitened[there] ** 2 + 2.0 * np.log(first.gains.spread[there])))
+    return dataclasses.replace(first, loss=loss)
+
+
+def _owners(guess: Guess) -> list[str]:
+    return [h.name for h in guess.hypotheses for _ in h.parameters]
+
+
+def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
+    """Keep a proposal if it is the best one of its effect; return whether it is."""
+    if proposal.key in best and proposal.factor <= best[proposal.key].factor:
+        return False
+    best[proposal.key] = proposal
+    return True
+
+
+def _normal_equations(
+    evidence: Evidence, tracks: Sequence[Track], table: Dictionary, residual_scale: float
+) -> tuple[NormalEquations, float]:
+    """Normal equations with the residual inputs scaled, and -2 log likelihood of the errors there."""
+    edges = np.cumsum([0, *(t.whitened.size for t in tracks)])
+    widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
+
+    def of_run(index: int) -> tuple[NormalEquations, float]:
+        track, rows = tracks[index], slice(edges[index], edges[index + 1])
+        scaled = scale_residual_inputs(track, residual_scale)
+        columns = np.hstack([*(c[rows] for c in table.columns), table.nuisance[rows]]).astype(float)
+        missing = ~np.isfinite(track.whitened)
+        if residual_scale != 1.0:
+            there = columns.reshape(*track.whitened.shape, -1)
+            there *= np.where(missing, 0.0, track.gains.spread)[:, :, None]
+            reweight_columns(
+                track.gains.slope, track.flow, missing, track.gains.gain, scaled.gains.gain, there,
+            )  # fmt: skip
+            there /= np.where(missing, 1.0, scaled.gains.spread)[:, :, None]
+        groups = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
+        errors = -np.nan_to_num(scaled.whitened).ravel()
+        return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
+
+    found = evidence.map(of_run, range(len(tracks)))
+    terms = found[0][0]
+    for other, _ in found[1:]:
+        terms = terms + other
+    return terms, sum(loss for _, loss in found)
+
+
+def scale_residual_inputs(track: Track, scale: float) -> Track:
+    """Return a linearised track with the standard deviations of its residual inputs scaled.
+
+    The filter is run again on the track's own linearisation.
+    """
+    if scale == 1.0:
+        return track
+    names, levels = list(track.names), _scaled(track.levels, scale)
+    m = len(levels.inputs)
+    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    initial = run.initial.copy()
+    first = len(names) - m
+    initial[first:] *= scale
+    initial[:, first:] *= scale
+    run = run._replace(initial=initial)
+    whitened, width = np.empty(run.error.shape), np.empty(run.error.shape)
+    gain = np.zeros(run.slope.shape)
+    loss = linear_filter(
+        run, row_variances(levels, track.run), state_drift(names, levels, track.run.period),
+        whitened, width, gain, np.empty(run.correction.shape), np.empty((0, len(names), len(names))),
+    )  # fmt: skip
+    gains = Gains(track.gains.slope, gain, width)
+    return dataclasses.replace(track, levels=levels, loss=loss, whitened=whitened, gains=gains)
+
+
+def _scaled(levels: Levels, scale: float) -> Levels:
+    return dataclasses.replace(levels, sizes=scale * levels.sizes)
+
+
+# -- refinement -------------------------------------------------------------------------------------------------------
+
+
+def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
+    """Refine the best proposals that the linear step holds for better than the model."""
+    chosen = [p for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
+    return [m for m in (refine(evidence, now, p) for p in chosen) if m is not None]
+
+
+def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
+    """Fit a proposal beside a model, re-estimate the noise levels, and compute the evidence.
+
+    Args:
+        evidence: whose base is the model; it is the base afterwards, too.
+        now: the model.
+        proposal: what is added.
+
+    Returns:
+        The extended model; None where the machine cannot follow the runs.
+    """
+    guess = extend(evidence.data.machine, now.guess, proposal)
+    tracks = tuple(scale_residual_inputs(t, proposal.residual_scale) for t in now.judged.tracks)
+    evidence.set_base(Judged(now.guess, tracks, now.judged.loss))
+    try:
+        kept = None
+        if proposal.parameter_scale > 0.0:
+            kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE)
+        fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
+        if not np.isfinite(fit.loss):
+            return None
+        evidence.set_base(now.judged)
+        if proposal.residual_scale == 1.0:
+            judged = evidence.judged(fit.guess)
+        else:
+            judged = evidence.judged_from(fit.guess, tracks[0].levels)
+    finally:
+        evidence.set_base(now.judged)
+    return Model(judged, fit, fit.whole_penalty) if np.isfinite(judged.loss) else None
+
+
+def extend(machine: Machine, guess: Guess, proposal: Proposal) -> Guess:
+    """Add a proposal to a model: its effects, or the uncertain parameters."""
+    if proposal.parts:
+        return Guess((*guess.parts, *proposal.parts))
+    group = scaled_calibration(machine, guess, proposal.parameter_scale)
+    return guess.plus(group, np.zeros(group.size)) if group.size else guess
+
+
+def scaled_calibration(machine: Machine, guess: Guess, scale: float) -> Hypothesis:
+    """Return the uncertain parameters as one group, without those of the effects that are there.
+
+    Args:
+        machine: the given machine.
+        guess: the effects.
+        scale: standard deviation relative to what the machine file states.
+    """
+    names = frozenset(n for n, h in zip(guess.names, _owners(guess), strict=True) if h != CALIBRATION)
+    group = calibration(machine, names)
+    table = {k: dataclasses.replace(p, prior_std=scale * p.prior_std) for k, p in group.parameters.items()}
+    return dataclasses.replace(group, parameters=table)
+
+
+# -- removal and exchange ---------------------------------------------------------------------------------------------
+
+
+def without_part(evidence: Evidence, given: Model, now: Model, index: int, rounds: Sequence[Round]) -> Model:
+    """Return a model without one of its effects, fitted again; the larger model is the base afterwards."""
+    guess = now.guess.without(index)
+    if not guess.parts:
+        return given
+    for known in rounds:
+        if keys_of(known.before) == {h.key for h in guess.hypotheses}:
+            return known.before
+    evidence.set_base(now.judged)
+    rest = settle(evidence, Model(evidence.judged(guess, reopened=True)))
+    evidence.set_base(now.judged)
+    return rest
+
+
+def remove_needless(
+    evidence: Evidence, given: Model, now: Model, rounds: Sequence[Round]
+) -> tuple[Model, list[Model]]:  # fmt: skip
+    """Remove effects, the weakest first, as long as that costs less than the smallest Bayes factor.
+
+    Returns:
+        The model, and for each of its parts the model without it.
+    """
+    while True:
+        rests = [without_part(evidence, given, now, k, rounds) for k in range(len(now.guess.parts))]
+        costs = [rest.score - now.score for rest in rests]
+        if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
+            return now, rests
+        now = rests[int(np.argmin(costs))]
+
+
+def exchange(
+    evidence: Evidence, now: Model, rests: Sequence[Model], rounds: Sequence[Round]
+) -> tuple[Model, list[Model], tuple[tuple[Rival, ...], ...]]:
+    """Compare each effect with what was refined in its place; a better rival replaces it.
+
+    Returns:
+        The model, for each part the model without it, and for each part its rivals.
+    """
+    rivals: list[tuple[Rival, ...]] = []
+    order, best = list(range(len(rests))), now
+    for index, (hypothesis, _) in enumerate(now.guess.parts):
+        origin = next((r for r in rounds if hypothesis.key in keys_of(r.after) - keys_of(r.before)), None)
+        if hypothesis.name == CALIBRATION or origin is None:
+            rivals.append(())
+            continue
+        rest, taken = rests[index], keys_of(now)
+        models = [
+            model if keys_of(origin.before) == keys_of(rest) else _beside(evidence, rest, origin, model)
+            for model in origin.others if not keys_of(model) - keys_of(origin.before) & taken
+        ]  # fmt: skip
+        models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
+        models = [settle(evidence, m) if m.score < now.score + _CLOSE else m for m in models]
+        same_size = [m for m in models if len(m.guess.parts) == len(rests)]
+        if best is now and same_size and same_size[0].score < now.score:
+            best = same_size[0]
+            models = [now, *(m for m in models if m is not best)]
+            order = [*(k for k in order if k != index), index]  # the effect added last is the last part
+        rivals.append(tuple(_rival(m, rest) for m in models))
+    return best, [rests[k] for k in order], tuple(rivals[k] for k in order)
+
+
+def _beside(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
+    """Return a rival beside the rest of the model, fitted again."""
+    old = keys_of(origin.before)
+    guess = rest.guess
+    for hypothesis, deviation in model.guess.parts:
+        if hypothesis.key not in old | keys_of(rest):
+            guess = guess.plus(hypothesis, deviation)
+    evidence.set_base(rest.judged)
+    fit = evidence.fit(guess, 0.0, steps=2, step=MIDDLE)
+    return Model(evidence.judged(fit.guess), fit, fit.whole_penalty)
+
+
+def _rival(model: Model, rest: Model) -> Rival:
+    """Describe a model by the effect that it has in addition to the rest."""
+    keys = [h.key for h in model.guess.hypotheses]
+    index = next((k for k, key in enumerate(keys) if key not in keys_of(rest) and key[0] != CALIBRATION), len(keys) - 1)
+    hypothesis = model.guess.hypotheses[index]
+    assert model.fit
+    charge = occam_penalty(moved_last(model.fit.information, model.guess, index), hypothesis.size)
+    return Rival(hypothesis, model.judged, charge, model.fit)

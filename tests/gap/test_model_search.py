@@ -1,0 +1,76 @@
+"""The search by evidence: versions of an effect, residual inputs that are scaled, and one whole search."""
+
+import numpy as np
+import pytest
+
+from hydrotele.estimate.evidence import Evidence
+from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.track import STEP
+from hydrotele.gap.answer import Answer, Explanation
+from hydrotele.gap.dictionary import list_versions
+from hydrotele.gap.find import find_gap
+from hydrotele.gap.model_search import scale_residual_inputs
+from hydrotele.gap.result import gap_document
+from hydrotele.logs.dataset import load_dataset, select_exciting_segments
+from hydrotele.machine.machine_file import load_machine
+from tests.measured import MEASURED
+
+
+def _effect(name, location):
+    return next(h for h in hypotheses(load_machine("cat215")) if h.key == (name, location))
+
+
+def test_versions_stay_inside_the_bounds():
+    """Leakage from the cylinder to the tank cannot be negative, so it has no version on that side."""
+    steps = [float(v.steps[0, 0]) for v in list_versions(_effect("tank_leakage", "boom"))]
+    assert steps == [0.3, 2.0]
+    relief = [float(v.steps[0, 0]) for v in list_versions(_effect("relief_pressure", "supply"))]
+    assert relief == [0.3, 2.0, -2.0]
+    for hypothesis in hypotheses(load_machine("cat215")):
+        for version in list_versions(hypothesis):
+            for step in version.steps.T:
+                assert np.all(step >= hypothesis.low) and np.all(step <= hypothesis.high)
+
+
+def test_the_answer_adds_up_and_names_the_deepest_sure_level():
+    laws = (
+        Explanation("coulomb_friction", "boom", 0.6),
+        Explanation("viscous_friction", "boom", 0.38),
+        Explanation("internal_leakage", "boom", 0.01),
+    )
+    answer = Answer(laws, 0.01)
+    assert answer.places() == {"boom": pytest.approx(0.99)}
+    assert answer.families("boom") == {"friction": pytest.approx(0.98), "leakage": pytest.approx(0.01)}
+    assert answer.level == ("boom", "friction")
+    assert sum(answer.places().values()) + answer.none == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def short_logs():
+    """The logs with a larger dead band of the stick, 8 s of each run."""
+    return select_exciting_segments(load_dataset([MEASURED / "open_05"], load_machine("cat215")), 24.0)
+
+
+def test_a_filter_with_scaled_residual_inputs_is_the_linear_one(short_logs):
+    """Nearly the same scale gives nearly the same innovations and likelihood."""
+    evidence = Evidence(short_logs, short_logs.fit[:1], 1, STEP, lacking=True)
+    try:
+        (track,) = evidence.judged(Guess()).tracks
+    finally:
+        evidence.close()
+    near = scale_residual_inputs(track, 1.0 + 1e-9)
+    assert near.loss == pytest.approx(track.loss, rel=1e-4)  # the track's states are nonlinear, these are linear
+    there = np.isfinite(track.whitened)
+    assert np.abs(near.whitened - track.whitened)[there].max() < 0.1  # of a standard deviation
+    smaller = scale_residual_inputs(track, 0.03)
+    assert np.all(smaller.gains.spread[there] < track.gains.spread[there] * (1.0 + 1e-9))
+
+
+def test_a_dead_band_is_found_with_its_size(short_logs):
+    gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2, method="regression")
+    assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "stick")]
+    # truth 0.085; a dead band is known to 0.001 even from half of the logs
+    assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.003)
+    (answer,) = gap_document(gap)["answers"]
+    assert answer["sure"][:1] == ["stick"]
+    assert sum(answer["laws"].values()) + answer["none"] == pytest.approx(1.0)
