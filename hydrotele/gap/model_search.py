@@ -47,7 +47,7 @@ _KEPT = 50  # effects that are linearised again after the first round
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
 _MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
-_UNEXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
+_EXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
 Progress = Callable[[str, float], None]
 
 
@@ -126,7 +126,7 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     given = Model(settle_noise(evidence, evidence.judged(Guess())))
-    candidates = timed([c for c in candidates if c.name not in _UNEXCLUDED], given.judged)
+    candidates = timed([c for c in candidates if c.name not in _EXCLUDED], given.judged)
     now, first = given, tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
@@ -475,7 +475,7 @@ def exchange(
         rest, taken = rests[index], keys_of(now)
         models = [
             model if keys_of(origin.before) == keys_of(rest) else _beside(evidence, rest, origin, model)
-            for model in origin.others if not keys_of(model) - keys_of(origin.before) & taken
+            for model in origin.others if _is_rival(keys_of(model) - keys_of(origin.before), taken)
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
         models = [settle(evidence, m) if m.score < now.score + _CLOSE else m for m in models]
@@ -486,6 +486,11 @@ def exchange(
             order = [*(k for k in order if k != index), index]  # the effect added last is the last part
         rivals.append(tuple(_rival(m, rest) for m in models))
     return best, [rests[k] for k in order], tuple(rivals[k] for k in order)
+
+
+def _is_rival(added: set[tuple[str, str]], taken: set[tuple[str, str]]) -> bool:
+    """Return whether a model adds effects, and none that the accepted model has."""
+    return bool(added - {(CALIBRATION, "all")}) and not added & taken
 
 
 def _beside(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
@@ -503,7 +508,7 @@ def _beside(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Mod
 def _rival(model: Model, rest: Model) -> Rival:
     """Describe a model by the effect that it has in addition to the rest."""
     keys = [h.key for h in model.guess.hypotheses]
-    index = next((k for k, key in enumerate(keys) if key not in keys_of(rest) and key[0] != CALIBRATION), len(keys) - 1)
+    index = next(k for k, key in enumerate(keys) if key not in keys_of(rest) and key[0] != CALIBRATION)
     hypothesis = model.guess.hypotheses[index]
     assert model.fit
     charge = occam_penalty(moved_last(model.fit.information, model.guess, index), hypothesis.size)

@@ -10,6 +10,7 @@ from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.model_search import scale_residual_inputs
+from hydrotele.gap.profiles import find_profiles
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset, select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
@@ -74,3 +75,18 @@ def test_a_dead_band_is_found_with_its_size(short_logs):
     (answer,) = gap_document(gap)["answers"]
     assert answer["sure"][:1] == ["stick"]
     assert sum(answer["laws"].values()) + answer["none"] == pytest.approx(1.0)
+
+
+def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
+    """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
+    data = select_exciting_segments(load_dataset([MEASURED / "open_02"], load_machine("cat215")), 45.0)
+    evidence = Evidence(data, data.fit, 2, STEP, lacking=True)
+    try:
+        evidence.set_base(Guess())
+        judged = evidence.set_base(Guess().plus(_effect("coulomb_friction", "stick"), np.array([0.5])))
+        (profile,) = find_profiles(evidence, judged)
+    finally:
+        evidence.close()
+    assert (profile.name, profile.variable) == ("coulomb_friction", "position")
+    spacing = profile.points[1] - profile.points[0]
+    assert abs(profile.points[np.argmax(profile.ratios)] - 0.72) < spacing
