@@ -36,7 +36,7 @@ from hydrotele.scenario.scenario import (
 )
 
 Key = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$")]
-MAX_RUNS = 100_000
+MAX_RUNS = 50_000  # of one sweep; checking them takes half a minute
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "choice")
 
 

@@ -60,7 +60,7 @@ EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100
         ("grid: {servo.lead: [1], servo.lead.x.y: [0]}", ":1", "servo.lead.x.y is part of servo.lead"),
         ("grid: {seed: [1, 2]}\nrepeat: 2", ":1", "seed cannot be varied"),
         ("set: {duration: -1}\nrepeat: 2", ":2: set", "duration: .*greater than 0"),
-        ("repeat: 1000000", ":2: repeat", "less than or equal to 100000"),
+        ("repeat: 1000000", ":2: repeat", "less than or equal to 50000"),
         ("name: ../etc\nrepeat: 2", ":2: name", "pattern"),
         ("grid: {folder: [a]}", ":2: grid.folder", "remove the key"),
         ("colour: red", ":1", "unknown key 'colour'; valid: description"),
