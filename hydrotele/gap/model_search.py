@@ -20,7 +20,7 @@ from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_pen
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run
-from hydrotele.estimate.track import COARSE, STARTLE, Levels, Track, by_kind, first_rows, row_variances, state_drift
+from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
 from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
@@ -342,7 +342,7 @@ def scale_residual_inputs(track: Track, scale: float) -> Track:
         return track
     names, levels = list(track.names), _scaled(track.levels, scale)
     m = len(levels.inputs)
-    run = linear_run(track, by_kind(names, STARTLE) ** 2)
+    run = linear_run(track, track.unknown_command_variances)
     initial = run.initial.copy()
     first = len(names) - m
     initial[first:] *= scale
@@ -351,7 +351,7 @@ def scale_residual_inputs(track: Track, scale: float) -> Track:
     whitened, width = np.empty(run.error.shape), np.empty(run.error.shape)
     gain = np.zeros(run.slope.shape)
     loss = linear_filter(
-        run, row_variances(levels, track.run), state_drift(names, levels, track.run.period),
+        run, row_variances(levels, track.run), state_drift(names, levels, track.run.period, track.scales),
         whitened, width, gain, np.empty(run.correction.shape), np.empty((0, len(names), len(names))),
     )  # fmt: skip
     gains = Gains(track.gains.slope, gain, width)
