@@ -16,7 +16,7 @@ from hydrotele.estimate.track import COARSE, Track
 
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one
-parameter and without start values of their own."""
+parameter and without stated start values."""
 _MIN_AMPLITUDE = 0.05  # prior standard deviations; a bound that is nearer leaves no room for a difference
 _START_RANGE = (0.3, 3.0)  # multiples of a version's amplitude within which the first refinement starts
 

@@ -47,7 +47,7 @@ _KEPT = 50  # effects that are linearised again after the first round
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
 _MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
-_EXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a search of its own
+_EXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a separate search
 Progress = Callable[[str, float], None]
 
 
@@ -340,7 +340,7 @@ def scale_residual_inputs(track: Track, scale: float) -> Track:
     """
     if scale == 1.0:
         return track
-    names, levels = list(track.names), _scaled(track.levels, scale)
+    names, levels = list(track.names), scale_levels(track.levels, scale)
     m = len(levels.inputs)
     run = linear_run(track, track.unknown_command_variances)
     initial = run.initial.copy()
@@ -358,7 +358,8 @@ def scale_residual_inputs(track: Track, scale: float) -> Track:
     return dataclasses.replace(track, levels=levels, loss=loss, whitened=whitened, gains=gains)
 
 
-def _scaled(levels: Levels, scale: float) -> Levels:
+def scale_levels(levels: Levels, scale: float) -> Levels:
+    """Scale the standard deviations of the residual inputs."""
     return dataclasses.replace(levels, sizes=scale * levels.sizes)
 
 
@@ -372,7 +373,7 @@ def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) ->
 
 
 def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
-    """Fit a proposal beside a model, re-estimate the noise levels, and compute the evidence.
+    """Fit a proposal together with a model, re-estimate the noise levels, and compute the evidence.
 
     Args:
         evidence: whose base is the model; it is the base afterwards, too.
@@ -474,7 +475,7 @@ def exchange(
             continue
         rest, taken = rests[index], keys_of(now)
         models = [
-            model if keys_of(origin.before) == keys_of(rest) else _beside(evidence, rest, origin, model)
+            model if keys_of(origin.before) == keys_of(rest) else add_rival(evidence, rest, origin, model)
             for model in origin.others if _is_rival(keys_of(model) - keys_of(origin.before), taken)
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
@@ -493,8 +494,8 @@ def _is_rival(added: set[tuple[str, str]], taken: set[tuple[str, str]]) -> bool:
     return bool(added - {(CALIBRATION, "all")}) and not added & taken
 
 
-def _beside(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
-    """Return a rival beside the rest of the model, fitted again."""
+def add_rival(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
+    """Fit a rival together with the rest of the model."""
     old = keys_of(origin.before)
     guess = rest.guess
     for hypothesis, deviation in model.guess.parts:
