@@ -120,7 +120,7 @@ def following_levels(data: Dataset) -> Levels:
     per_time = math.sqrt(DRIFT_TIME / period)
     ahead = max(1, round(_RATE_OVER / period))
     share = np.sqrt(period / _FOLLOW)
-    for c in np.flatnonzero(~np.isfinite(data.noise)):
+    for c in np.flatnonzero(~np.isfinite(data.noise)).tolist():
         signal, columns = parse_channel(data.channels[c]), [run.reading[:, c] for run in data.fit]
         rough = _size([np.diff(column, 2) for column in columns]) / np.sqrt(6.0)
         noise[c] = max(rough, _SMALLEST * _size(columns), resolution[c])
@@ -191,7 +191,7 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
                               run.period, steps, past, made)  # fmt: skip
             return out
 
-        return Runner(track.predicted, free, describe_lost_track(track, data.channels, np.inf))
+        return Runner(track.predicted, free, describe_lost_track(track, data.channels))
 
     return prepare
 

@@ -27,7 +27,7 @@ from hydrotele.estimate.hypothesis import (
     numbers,
     with_shape,
 )
-from hydrotele.estimate.levels import MAX_ERROR_RATIO, check_filter_follows, input_excess, noise_prior
+from hydrotele.estimate.levels import check_filter_follows, input_excess, noise_prior
 from hydrotele.estimate.track import COARSE, Levels, Track, track_run
 from hydrotele.gap.calibrating import (
     FIT_STEPS,
@@ -269,7 +269,7 @@ def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progr
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
-    check_filter_follows(base.tracks, evidence.data.channels, MAX_ERROR_RATIO)
+    check_filter_follows(base.tracks, evidence.data.channels)
     evidence.keep(base)
     candidates = timed(candidates, base)
     grown = _begun(evidence, base, candidates, tell)
