@@ -58,7 +58,7 @@ def gap_to_folder(
     """Find the effects that explain the differences (gap) between a machine model and its logs.
 
     The results are printed and written to a folder, with the corrected machine. The output folder is
-    written completely or not at all. Until then, `TARGET.interim` beside it holds the best answer so far.
+    written completely or not at all. Until then, the folder `TARGET.interim` holds the best answer so far.
 
     Args:
         data: log files, folders of logs, run folders.

@@ -144,7 +144,7 @@ class Evidence:
         enough on the way to a fit, not for comparing it. With `reopened`, unknown inputs that the
         base has no need of are tried again: a guess with fewer parts may need them.
 
-        A guess outside the model's domain has zero likelihood: the tracks of the base, an infinite loss.
+        Outside the model's domain the likelihood is zero: the tracks of the base, an infinite loss.
         """
         try:
             machine = guess.machine(self.data.machine)

@@ -518,7 +518,7 @@ _LIKELY_REASONS = (
 
 
 def check_filter_follows(tracks: Sequence[Track], channels: Sequence[str]) -> None:
-    """Check that the states of a filter do not diverge; large errors alone may be what the model lacks.
+    """Check that the states of a filter do not diverge; large errors alone may be a missing effect.
 
     Args:
         tracks: of the runs.

@@ -48,7 +48,7 @@ def main() -> None:
     lines += ["", f"{len(judged) - len(failed)} of {len(judged)} rows say differs.", ""]
     unbroken = [name for name, claim in series.claims.items() if claim.fault is None]
     if unbroken and not names:
-        lines += [f"Rows without a verdict have no fault: {', '.join(unbroken)}.", ""]
+        lines += [f"No fault was planted for these rows: {', '.join(unbroken)}.", ""]
     text = "\n".join(lines)
     print(text)
     if arguments.out:
