@@ -181,14 +181,16 @@ def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
 
 
 def measure_calibration_errors(seed: int, changes: Changes) -> Sample:
-    """Calibrate a machine with and without the poses of bent joints, and compute the errors of both results.
+    """Calibrate a machine with and without the poses in which joints bend under gravity; return the errors of both.
+
+    The bending is a simulated fault: it changes the measured angles of the calibrator's joints.
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
         changes: changes of `SETTINGS`: drift, sensor errors, bends and other conditions.
 
     Returns:
-        Errors of parameters, end points, distances and cylinder triangles, with their curves.
+        Errors of parameters, end points, distances and cylinder triangles, and plots of these errors.
     """
     chosen = merge_settings(SETTINGS, changes)
     rng = np.random.default_rng([38, seed])

@@ -262,7 +262,10 @@ def fit_autoregression(error: np.ndarray, order: int | None = None) -> np.ndarra
 
 
 def _pseudo_inverse(x: np.ndarray, ridge: float, truncation: float) -> tuple[np.ndarray, _SolutionProperties]:
-    """Return the pseudo-inverse (p, N) of x (N, p), with ridge and truncated singular values, and its condition."""
+    """Return the pseudo-inverse (p, N) of x (N, p), with ridge and truncated singular values.
+
+    Also returns the condition number of x, the inverse of the normal matrix, and the number of kept singular values.
+    """
     u, s, v = np.linalg.svd(x, full_matrices=False)
     kept = s > max(truncation, 1e-14) * s[0]
     squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
