@@ -159,13 +159,13 @@ def parse_xml(
     Raises:
         InputError: the content is not XML, is nested too deeply or declares a document type.
     """
-    parser, builder, depth, deepest = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0
+    parser, builder, depth, deepest, file = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0, Path(path)
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth, deepest
         depth += 1
         deepest = max(depth, deepest)
-        origins[builder.start(tag, attributes)] = Path(path), parser.CurrentLineNumber
+        origins[builder.start(tag, attributes)] = file, parser.CurrentLineNumber
 
     def end(tag: str) -> None:
         nonlocal depth
