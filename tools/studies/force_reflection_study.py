@@ -232,7 +232,8 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         "As shipped: dead band of 1.5 mm, overlap of the valves, sensors of Khoshzaban 1992. "
         "Both limits are the geometric mean of the last stable and the first unstable ratio. The "
         f"ratios are a ladder with steps of 1.25 from {LADDER[0]:g} to {LADDER[-1]:.0f} times the "
-        "linear prediction.",
+        "linear prediction. Each limit comes from one run per ratio. As shipped, whether a run near its limit "
+        "becomes unstable also depends on the seed (sensor noise, operator), as the next table shows.",
         "", "## Stiffness feedback with the same reflection", "",
         f"Direct force has the ratio {small(sides[0][2])}. With it, both structures give the same "
         "force in the hand at the edge of the dead band. Both have the dead band and real sensors. Swing: lower is "
