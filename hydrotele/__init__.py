@@ -33,7 +33,8 @@ _ignore_local_configuration_files()
 
 
 _PUBLIC = {
-    "control.endpoint_force": ("endpoint_force_of_log", "identify_gravity"),
+    "control.endpoint_force": ("endpoint_force_of_log",),
+    "control.gravity_model": ("identify_gravity",),
     "core.errors": ("InputError",),
     "effects": ("EFFECTS", "apply_effect", "load_effects"),
     "gap.find": ("find_gap",),

@@ -1,6 +1,7 @@
 """The public names of hydrotele and where they are, for type checkers."""
 
-from .control.endpoint_force import endpoint_force_of_log, identify_gravity
+from .control.endpoint_force import endpoint_force_of_log
+from .control.gravity_model import identify_gravity
 from .core.errors import InputError
 from .effects import EFFECTS, apply_effect, load_effects
 from .envs.controllers.catalogue import make_controller

@@ -11,7 +11,7 @@ import numpy as np
 
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import steps_per_row
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.loop import CalibrationLoop, frame_after_links
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, frame_after_links
 
 
 class Drift(NamedTuple):
@@ -27,7 +27,7 @@ class Drift(NamedTuple):
 class Poses:
     """Readings of M poses while one link moves and the others are held.
 
-    Angles have the signs of Khoshzaban's (K) D-H convention, see `hydrotele.calibrate.loop`.
+    Angles have the signs of Khoshzaban's (K) D-H convention, see `hydrotele.calibrate.calibration_loop`.
 
     Attributes:
         link: the moving link.

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.optimize
 import scipy.stats
 
-from hydrotele.calibrate.arm import (
+from hydrotele.calibrate.arm_identification import (
     ArmFit,
     StageEquations,
     assemble_fit,
@@ -25,7 +25,7 @@ from hydrotele.calibrate.arm import (
     sort_stages,
 )
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position_and_derivatives
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, ball_position_and_derivatives
 
 FALSE_ALARM_PROBABILITY = 0.005
 """Probability of finding a region in a complete measurement without corruption."""

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from hydrotele.calibrate.arm import ArmFit, StageEquations
+from hydrotele.calibrate.arm_identification import ArmFit, StageEquations
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position_from_axis, frame_after_links
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, ball_position_from_axis, frame_after_links
 
 _MAX_ALTERNATIONS = 3  # alternations of noise model and parameters; the third changes the f_k by below 1 %
 _MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far above that of any calibrator

@@ -14,9 +14,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from hydrotele.cli.calibrating import app as calibrate_app
+from hydrotele.cli.calibrate_options import app as calibrate_app
+from hydrotele.cli.haptic_device_options import HAPTIC_EPILOG, haptic_device
+from hydrotele.cli.identify_operator_command import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.number_options import MAX_PROCESSES, NumberCheckingGroup
-from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.option_values import (
     CommandGroup,
     QuietOption,
@@ -24,8 +25,7 @@ from hydrotele.cli.option_values import (
     parse_overrides,
     parse_positive_numbers,
 )
-from hydrotele.cli.overview import DESCRIPTION, format_program_help
-from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
+from hydrotele.cli.program_help import DESCRIPTION, format_program_help
 from hydrotele.core.errors import InputError
 
 
@@ -90,7 +90,7 @@ def compare(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Compare open-loop predictions of several models with logs: RMS error per channel."""
-    from hydrotele.cli.comparing import compare_models
+    from hydrotele.cli.compare_command import compare_models
 
     compare_models(
         machine, data, tool, heldout, sensors, parse_positive_numbers("--horizons", horizons), baseline or [],
@@ -142,7 +142,7 @@ def drive(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Drive a machine in real time; write the same files as `run`."""
-    from hydrotele.cli.driving import DriveOptions, drive_to_folder
+    from hydrotele.cli.drive_command import DriveOptions, drive_to_folder
 
     drive_to_folder(
         DriveOptions(
@@ -199,13 +199,13 @@ def sweep(
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Run variations of a scenario (grid or random samples); collect the results in a table."""
-    from hydrotele.cli.running import SweepOptions, sweep_to_folder
+    from hydrotele.cli.run_command import SweepOptions, sweep_to_folder
 
     sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
 
 class OverviewGroup(NumberCheckingGroup):
-    """Command group whose help is the text of `cli.overview`."""
+    """Command group whose help is the text of `cli.program_help`."""
 
     def format_help(self, ctx, formatter) -> None:
         """Print the overview of all commands."""
@@ -254,7 +254,7 @@ def run(
     json: JsonOption = False,
 ) -> None:
     """Simulate a scenario; write logs, a rerun recording, a summary and the MJCF."""
-    from hydrotele.cli.running import run_to_folder
+    from hydrotele.cli.run_command import run_to_folder
 
     run_to_folder(scenario, out, parse_overrides(set_ or []) | machine_overrides(machine, tool), review, json)
 
@@ -285,7 +285,7 @@ def replay(
     force: ForceOption = False,
 ) -> None:
     """Simulate the model with the commands of a log; print the prediction errors."""
-    from hydrotele.cli.reviewing import replay_logs
+    from hydrotele.cli.replay_command import replay_logs
 
     replay_logs(logs, machine, tool, timestep, out, json, force)
 
@@ -329,7 +329,7 @@ def gap(
     For a mechanism without hydraulics, give --mjcf or the name of a shipped model without
     machine.yaml, such as palida. The logs must contain positions and drive forces.
     """
-    from hydrotele.cli.gapping import find_mechanism_files, gap_mjcf_to_folder, gap_to_folder
+    from hydrotele.cli.gap_command import find_mechanism_files, gap_mjcf_to_folder, gap_to_folder
 
     model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
@@ -399,13 +399,13 @@ def identify(
     With --mjcf, any mechanism with hinge, slide and ball joints can be identified. Its kinematic
     loops must be closed by connect or weld constraints.
     """
-    from hydrotele.cli.identifying import (
+    from hydrotele.cli.identify_command import (
         IdentificationOptions,
         identify_mjcf_to_folder,
         identify_to_folder,
     )
     from hydrotele.identify.estimation import Estimator
-    from hydrotele.identify.motion import Processing
+    from hydrotele.identify.joint_motion import Processing
 
     choices = IdentificationOptions(
         model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
@@ -447,7 +447,7 @@ def excite(
     json: JsonOption = False,
 ) -> None:
     """Design the most informative trajectory within a machine's limits."""
-    from hydrotele.cli.identifying import design_excitation_file
+    from hydrotele.cli.identify_command import design_excitation_file
 
     design_excitation_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
 
@@ -500,7 +500,7 @@ def analyse_teleop(
     json: JsonOption = False,
 ) -> None:
     """Analyse a teleoperator as a two-port: transparency, passivity, stability, delay margins."""
-    from hydrotele.cli.analysing import RobustnessOptions, analyse_case_or_scenario_to_folder
+    from hydrotele.cli.analyse_command import RobustnessOptions, analyse_case_or_scenario_to_folder
 
     pairs = parse_overrides(set_ or [])
     how = RobustnessOptions(period, delays, operators) if robust or delays else None
@@ -544,7 +544,7 @@ def review(
     --screenshot, --plot and --video writes a file. If one of them is given, no window is opened;
     several can be given together.
     """
-    from hydrotele.cli.reviewing import ReviewOutputs, review_logs
+    from hydrotele.cli.review_command import ReviewOutputs, review_logs
 
     outputs = ReviewOutputs(out, screenshot, at, plot, video, port if serve else None)
     review_logs(log, log2, machine, tool, outputs, force)
@@ -563,7 +563,7 @@ def list_(
     json: JsonOption = False,
 ) -> None:
     """List the available machines, scenarios, sweeps, effects and environments."""
-    from hydrotele.cli.catalogue import list_items
+    from hydrotele.cli.list_command import list_items
 
     list_items(what, json)
 
@@ -582,7 +582,7 @@ def validate(
     Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
     next to the log, or that of its metadata.
     """
-    from hydrotele.cli.catalogue import LogMachine, validate_files
+    from hydrotele.cli.validate_command import LogMachine, validate_files
 
     validate_files(files, json, LogMachine(machine, tool, force))
 
@@ -600,7 +600,7 @@ def export(
     effects: EffectFilesOption = None,
 ) -> None:
     """Write the complete MJCF of a machine or joystick, or an image of it."""
-    from hydrotele.cli.catalogue import export_machine
+    from hydrotele.cli.export_command import export_machine
 
     export_machine(machine, tool, out, picture, camera)
 
@@ -631,7 +631,7 @@ def experiments(
     agrees, differs (with the measured reason), undecided, or cannot be computed.
     The exit status is 1 if a published result differs.
     """
-    from hydrotele.cli.experimenting import experiments_to_folder
+    from hydrotele.cli.experiments_command import experiments_to_folder
 
     rows = experiments_to_folder(name, out, seeds, jobs, json)
     if any(row.verdict == "differs" and row.kind == "document" for row in rows):
@@ -646,7 +646,7 @@ def bench(
     json: JsonOption = False,
 ) -> None:
     """Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up."""
-    from hydrotele.cli.bench import run_benchmarks
+    from hydrotele.cli.bench_command import run_benchmarks
 
     run_benchmarks(save, compare, quick, json)
 
@@ -658,7 +658,7 @@ def compile_functions(
     ] = None,
 ) -> None:
     """Compile all numerical functions now, so that later commands start without delay."""
-    from hydrotele.cli.compiling import compile_all
+    from hydrotele.cli.compile_command import compile_all
 
     compile_all(jobs)
 
@@ -668,7 +668,7 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("demo"),
 ) -> None:
     """Simulate an excavator, replay its log and draw the results."""
-    from hydrotele.cli.running import run_demo
+    from hydrotele.cli.run_command import run_demo
 
     run_demo(out)
 

@@ -3,7 +3,7 @@
 import os
 import sys
 
-from hydrotele.cli.overview import format_program_help
+from hydrotele.cli.program_help import format_program_help
 
 
 def main() -> None:

@@ -1,24 +1,23 @@
 """Estimation of the force at the tip of an arm from the pressures of its drives.
 
-The static estimate subtracts the gravity torque, which is linear in a few identified parameters,
-from the drive torque (Zhu 1994, 6.1). The dynamic estimate uses the complete model with inertia,
-Coriolis forces, friction and the closed chains of the cylinders.
+The static estimate subtracts the gravity torque (`control.gravity_model`) from the drive torque (Zhu
+1994, 6.1). The dynamic estimate uses the complete model with inertia, Coriolis forces, friction and
+the closed chains of the cylinders.
 
 A fast filter gives positions, rates, accelerations and pressures with equal delay, so that the
 force balance between them holds and friction corresponds to the rate of the same time. The result passes a
 slow filter, because the force error from angle noise grows with the fifth power of the frequency.
 
-`EndpointForce` estimates online, `endpoint_force_of_log` from a log. `identify_gravity` identifies
-the static model from a log of slow motion.
+`EndpointForce` estimates online, `endpoint_force_of_log` from a log.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from hydrotele.control.gravity_model import GravityModel, fit_gravity_to_masses
 from hydrotele.control.state_filter import (
     LAST_READING,
     RATE,
@@ -26,277 +25,26 @@ from hydrotele.control.state_filter import (
     VALUE,
     filter_delay,
     filter_noise_gains,
-    filter_signal,
     filter_step,
     filter_step_matrix,
 )
-from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.control.tip_balance import (
     arm_joints,
     arm_record,
     compute_dynamic_external_forces,
     compute_static_external_forces,
     create_arm_balance,
-    gravity_parameter_count,
     independent_axes,
-    joint_gravity_torque,
     read_arm_record,
     solve_tip_force,
 )
 from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
-from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorSet, reading_noise_rms
-
-_GRAVITY_NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
-_POSES_PER_JOINT = 9  # poses per joint at which the static model is fitted to the masses
-_INITIAL_GRAVITY_STD = 3.0e5  # N m, initial standard deviation of the gravity parameters: no prior knowledge
-_INITIAL_FRICTION_STD = 3.0e4  # N, initial standard deviation of dry friction
-EQUATION_PERIOD_S = 0.2
-"""Time between the equations of an identification [s]."""
-_SLOW_MOTION_BANDWIDTH_HZ = 1.0  # Hz, bandwidth of the filter of slow motion
-_MIN_SLIDING_SPEED = 5.0e-3  # m/s or rad/s: slower drives may be at rest and give no friction equation
-_MIN_EQUATIONS = 50  # equations before the parameters are a valid estimate (Zhu 1994, 6.1.3)
-_NORMAL95 = 1.96
-
-
-@dataclass(frozen=True)
-class GravityModel:
-    """Parameters of the static gravity model.
-
-    Attributes:
-        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5, where C23 is
-            cos(q2 + q3) and so on.
-        value: (p,) parameters [N m].
-        ci95_half_width: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
-        history: (r, p) parameters after every equation [N m]; empty if computed from masses.
-        residual: (m - 1,) RMS of the residual torques, from the boom outwards [N m].
-        outlier_indices: (q,) indices of equations removed as outliers, sorted.
-    """
-
-    names: tuple[str, ...]
-    value: np.ndarray
-    ci95_half_width: np.ndarray
-    history: np.ndarray
-    residual: np.ndarray
-    outlier_indices: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-
-
-def gravity_regressor(q: np.ndarray) -> np.ndarray:
-    """Return the regressor Y of the static model `tau = Y(q) P` of an arm's gravity torques tau [N m].
-
-    P are the gravity parameters [N m].
-
-    Args:
-        q: (m,) joint angles of the arm, swing first [rad].
-
-    Returns:
-        (m, p) regressor of m joints and p parameters [1].
-
-    Source: Zhu 1994, 6.8 and 6.9.
-    """
-    joint, size = np.arange(len(q)), gravity_parameter_count(len(q))
-    units = np.eye(size)
-    return np.array([[joint_gravity_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))])
-
-
-def fit_gravity_to_masses(machine: Machine) -> GravityModel:
-    """Fit the static model to the gravity torques of a machine's masses.
-
-    The complete model at rest is fitted over the ranges of the joints. The gravity torques of
-    the links have the form of the static model. Those of cylinders and linkages do not, which causes the
-    residual torques.
-
-    Args:
-        machine: machine with an arm whose joints are driven by valves.
-
-    Returns:
-        The gravity parameters and the residual torques of the fit.
-
-    Raises:
-        InputError: the arm's joints are not all driven.
-    """
-    arm = create_arm_balance(machine, f"gravity of {machine.name}")
-    joints = arm_joints(machine)
-    ranges = [machine.joints[j].range or (-math.pi, math.pi) for j in joints[1:]]
-    grid = np.meshgrid(*(np.linspace(low, high, _POSES_PER_JOINT) for low, high in ranges), indexing="ij")
-    poses = np.column_stack([np.zeros(grid[0].size), *(axis.ravel() for axis in grid)])
-    torque = np.zeros((len(poses), len(joints)))
-    _gravity_torques(arm, poses, torque)
-    rows = np.array([gravity_regressor(q)[1:] for q in poses])
-    value = np.linalg.lstsq(rows.reshape(-1, rows.shape[2]), torque[:, 1:].ravel(), rcond=None)[0]
-    left = torque[:, 1:] - rows @ value
-    size = len(value)
-    return GravityModel(
-        _GRAVITY_NAMES[:size],
-        value,
-        np.zeros(size),
-        np.zeros((0, size)),
-        np.sqrt(np.mean(left**2, axis=0)),
-    )
-
-
-@compiled
-def _gravity_torques(arm, poses, torque):
-    """Compute the gravity torques on the m joints of an arm in r `poses` (r, m) [rad].
-
-    They are written to `torque` (r, m) [N m].
-    """
-    outside = np.zeros(len(arm.work))
-    for row in range(len(poses)):
-        for i in range(len(arm.joint)):
-            arm.z[arm.joint[i]] = poses[row, i]
-        compute_dynamic_external_forces(arm, outside)
-        for i in range(len(arm.joint)):
-            torque[row, i] = outside[arm.joint[i]]
-
-
-class SlowMotion(NamedTuple):
-    """Filtered signals of slow motion of an arm with m joints, r rows.
-
-    Attributes:
-        angle: (r, m) joint angles [rad].
-        torque: (r, m) torques of the drives [N m].
-        friction_torque: (r, m) torque per newton of dry friction of the drive, with the sign of the joint rate
-            [m]; 0 if the drive may be at rest.
-    """
-
-    angle: np.ndarray
-    torque: np.ndarray
-    friction_torque: np.ndarray
-
-
-def extract_slow_motion(machine: Machine, log: Log, period: float = EQUATION_PERIOD_S) -> SlowMotion:
-    """Compute joint angles and drive torques of an arm from a log of slow motion.
-
-    Cylinder forces are converted to torques by virtual work through the linkages.
-
-    Args:
-        machine: the machine.
-        log: measured angles and pressures.
-        period: time between rows [s], rounded to a multiple of the log's period.
-
-    Returns:
-        One row per period.
-
-    Raises:
-        InputError: a channel is missing, or a joint is not driven by a valve.
-
-    Source: Zhu 1994, 6.12 and 6.13.
-    """
-    independent_axes(machine, f"torques of {machine.name}")
-    driver = {axis.joint: name for name, axis in machine.axes.items()}
-    table, every = (
-        filter_step_matrix(_SLOW_MOTION_BANDWIDTH_HZ, 1.0 / log.rate),
-        max(1, round(period * log.rate)),
-    )
-    columns = []
-    for name in (driver[joint] for joint in arm_joints(machine)):
-        head, rod = machine.axes[name].hydraulic_drive.effective_areas
-        force = head * log[f"pressure_head.{name}"] - rod * log[f"pressure_rod.{name}"]
-        moved, pushed = (filter_signal(table, x)[::every] for x in (log[f"angle.{name}"], force))
-        lever = axis_linkage(machine, name).rate(moved[:, VALUE])
-        speed = np.abs(lever * moved[:, RATE])
-        way = np.where(speed > _MIN_SLIDING_SPEED, np.sign(moved[:, RATE]), 0.0)
-        columns.append((moved[:, VALUE], lever * pushed[:, VALUE], np.abs(lever) * way))
-    return SlowMotion(*(np.column_stack(part) for part in zip(*columns, strict=True)))
-
-
-def identify_gravity(
-    machine: Machine, log: Log, friction: bool = True, *, remove_outliers: bool = False,
-    period: float = EQUATION_PERIOD_S,
-) -> GravityModel:  # fmt: skip
-    """Identify the static gravity model from a log of slow motion by recursive least squares.
-
-    With `remove_outliers`, equations with large residuals, as during a temporary sensor failure,
-    are removed and the estimation is repeated until none is left. By Chauvenet's criterion, a
-    residual is large if less than half an equation is expected to exceed it. The expected normal
-    distribution has the scale of the median absolute residual of the joint.
-
-    Args:
-        machine: the machine; its masses are not used.
-        log: measured angles and pressures of joints that move slowly back and forth over their
-            ranges.
-        friction: whether dry friction of every drive is estimated as well. If not, it averages out
-            in the torques, as in Zhu.
-        remove_outliers: whether equations with large residuals are removed.
-        period: time between equations [s].
-
-    Returns:
-        The parameters with their history.
-
-    Raises:
-        InputError: a channel is missing, the log is too short, or too few equations are left after
-            removing outliers.
-
-    Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
-    """
-    moves = extract_slow_motion(machine, log, period)
-    size, joints = gravity_parameter_count(moves.angle.shape[1]), moves.angle.shape[1]
-    rows = np.array([gravity_regressor(q)[1:] for q in moves.angle])
-    if friction:
-        rubbing = moves.friction_torque[:, 1:, None] * np.eye(joints - 1)
-        rows = np.concatenate([rows, rubbing], axis=2)
-    torque, kept = moves.torque[:, 1:], np.ones(len(rows), bool)
-    while True:
-        if np.count_nonzero(kept) < _MIN_EQUATIONS:
-            raise InputError(log.source, f"at least {_MIN_EQUATIONS * period:g} s of slow motion are needed")
-        found, history = _solve_recursively(rows[kept], torque[kept], size)
-        left = torque - rows @ found.value
-        outside = kept & _are_outliers(left, kept)
-        if not remove_outliers or not outside.any():
-            break
-        kept &= ~outside
-    left = left[kept]
-    usual = math.sqrt(float(np.sum(left**2)) / (left.size - rows.shape[2]))
-    return GravityModel(
-        _GRAVITY_NAMES[:size],
-        found.value[:size],
-        _NORMAL95 * usual * np.sqrt(np.diag(found.covariance)[:size]),
-        np.array(history),
-        np.sqrt(np.mean(left**2, axis=0)),
-        np.flatnonzero(~kept),
-    )
-
-
-def _solve_recursively(
-    rows: np.ndarray, torque: np.ndarray, size: int
-) -> tuple[RecursiveLeastSquares, list[np.ndarray]]:
-    """Solve the equations `rows @ P = torque` by recursive least squares.
-
-    Args:
-        rows: (r, m - 1, p) regressors of r instants, without the swing joint.
-        torque: (r, m - 1) torques of the drives [N m].
-        size: number of gravity parameters, which come first; the others are dry friction.
-
-    Returns:
-        The estimator with the final parameters P, and the gravity parameters (size,) after every
-        instant [N m].
-    """
-    spread = np.append(np.full(size, _INITIAL_GRAVITY_STD), np.full(rows.shape[2] - size, _INITIAL_FRICTION_STD))
-    found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
-    for table, torques in zip(rows, torque, strict=True):
-        for row, one in zip(table, torques, strict=True):
-            found.update(row, one)
-        history.append(found.value[:size])
-    return found, history
-
-
-def _are_outliers(residuals: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return for each instant (r,) whether a residual `residuals` (r, m - 1) is an outlier (Chauvenet's criterion).
-
-    The scale of the residuals is computed only from the instants with `kept` (r,) True, the others having been
-    removed as outliers before.
-    """
-    from scipy.special import ndtri  # imported here, because runs do not need it
-
-    scale = np.median(np.abs(residuals[kept]), axis=0) / ndtri(0.75)
-    most = -ndtri(0.25 / np.count_nonzero(kept))
-    return np.asarray((np.abs(residuals) > most * scale).any(axis=1))
-
+from hydrotele.machine.machine import Machine, reading_noise_rms
+from hydrotele.machine.sensors import SensorSet
 
 STATUS_WAITING, STATUS_GOOD, STATUS_BAD, STATUS_SINGULAR = range(4)
 _JOINT_ROW, _HEAD_ROW, _ROD_ROW = range(3)  # rows of `DriveReadings.last`

@@ -5,14 +5,15 @@ import numpy as np
 from hydrotele.control.plan import Plan
 from hydrotele.control.servo import ForceReferences
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.identify.setup import machine_setup
-from hydrotele.identify.smoothing import SmoothedSignal, filter_zero_phase
+from hydrotele.hydraulics.actuator_layout import actuator_order
+from hydrotele.identify.regressor_setup import machine_setup
+from hydrotele.identify.smoothed_signal import SmoothedSignal
+from hydrotele.identify.zero_phase_filter import filter_zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import make_regressor
+from hydrotele.multibody.regressor import make_regressor
 from hydrotele.scenario.scenario import Servo
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 
 NOMINAL = "nominal"
 

@@ -10,11 +10,12 @@ from itertools import zip_longest
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
+from hydrotele.control.arm_kinematics import arm_axes, pose_to_joints
+from hydrotele.control.resolved_motion import ResolvedMotion
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import (
+from hydrotele.scenario.pilots import (
     ConstantPilot,
     FourierPilot,
     LinesPilot,

@@ -13,27 +13,15 @@ import math
 
 import numpy as np
 
+from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import compiled
-from hydrotele.core.errors import InputError
-from hydrotele.kinematics.arm import UnreachableError, inverse_kinematics
-from hydrotele.kinematics.from_machine import (
-    arm_geometry,
-    feller_geometry,
-    is_planar_arm,
-    solve_joints_for_tip,
-    tip_position,
-)
-from hydrotele.kinematics.task import (
-    REACHED,
-    arm_parameters,
+from hydrotele.kinematics.task_space import (
     compute_joint_rates,
     compute_tip_pose,
     solve_joint_angles,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Pose
 
-COORDINATES = ("r", "theta", "z", "attitude", "head")
 _RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: about one control period
 
 
@@ -42,7 +30,7 @@ def step_references_to_pose(arm_constants, ranges, target, rate, blocked, pose, 
     """Set joint references to the inverse kinematics of a target pose, or hold them if it is out of reach.
 
     Args:
-        arm_constants: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_constants: (9,) parameters of the arm, of `kinematics.task_space.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         target: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) time derivative of the target [m/s], [rad/s].
@@ -87,7 +75,7 @@ def step_references_by_rate(arm_constants, ranges, measured, rate, period, pose,
     """Convert a rate of the tip to joint rates and integrate the joint references, or hold them at a limit.
 
     Args:
-        arm_constants: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_constants: (9,) parameters of the arm, of `kinematics.task_space.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         measured: (k,) joint angles at which the Jacobian is evaluated [rad].
         rate: (5,) rate of r, theta, z, attitude and head [m/s], [rad/s].
@@ -128,7 +116,7 @@ class ResolvedMotion:
     """State of the resolved-motion controller.
 
     Attributes:
-        arm_geometry_parameters: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_geometry_parameters: (9,) parameters of the arm, of `kinematics.task_space.arm_parameters`.
         axes: k axis names from swing outwards, 3 to 5.
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.
@@ -206,87 +194,3 @@ def _pad_to_five(values) -> np.ndarray:
     out = np.zeros(5)
     out[: min(5, len(values))] = values[:5]
     return out
-
-
-def arm_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axis names of the arm's joints, from swing outwards.
-
-    Raises:
-        InputError: the machine has no arm, or a joint of its arm is not driven.
-    """
-    arm = machine.arm
-    if arm is None:
-        raise InputError(f"machine {machine.name}", "has no arm for resolved motion or poses")
-    by_joint = {axis.joint: name for name, axis in machine.axes.items()}
-    joints = [j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j]
-    if missing := [j for j in joints if j not in by_joint]:
-        raise InputError(f"machine {machine.name}: arm", f"{missing} are not driven by an axis")
-    return tuple(by_joint[j] for j in joints)
-
-
-def arm_specification(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
-    """Return kinematic parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
-
-    The axes are ordered from swing outwards.
-
-    Raises:
-        InputError: the machine has no arm, or a joint of its arm is not driven.
-    """
-    axes = arm_axes(machine)
-    limits = [machine.joints[machine.axes[a].joint].range for a in axes]
-    ranges = np.array([limit or (-math.inf, math.inf) for limit in limits])
-    headed = machine.arm is not None and machine.arm.head is not None
-    geometry = feller_geometry(machine) if headed else arm_geometry(machine)
-    return arm_parameters(geometry), axes, ranges
-
-
-def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], where: str = "pose") -> dict[str, float]:
-    """Compute the axis positions at which the tip has a pose (inverse kinematics).
-
-    The joint axes of a calibrated arm may be twisted out of its plane. For an arm of three joints,
-    Newton's method then refines the solution of the planar arm.
-
-    Args:
-        machine: the machine.
-        pose: target pose; without `attitude` the tool keeps that of `current`.
-        current: axis -> current position [rad].
-        where: key path of the pose, for messages.
-
-    Returns:
-        Axis -> position [rad].
-
-    Raises:
-        InputError: the pose is out of reach or violates a joint range.
-    """
-    numbers, axes, ranges = arm_specification(machine)
-    attitude, head = pose.attitude, pose.head
-    if attitude is None:
-        attitude = sum(current[a] for a in axes[1:4])
-    if head is None:
-        head = current[axes[4]] if len(axes) == 5 else 0.0
-    joints, wanted = np.zeros(len(axes)), np.array([pose.r, pose.theta, pose.z, attitude, head])
-    if solve_joint_angles(numbers, wanted, pose.theta, joints) != REACHED:
-        raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
-    if len(axes) == 3 and not is_planar_arm(machine):
-        place = (pose.r * math.cos(pose.theta), pose.r * math.sin(pose.theta), pose.z)
-        joints = solve_joints_for_tip(machine, np.array(place), joints)
-        if not np.allclose(tip_position(machine, joints), place, rtol=0.0, atol=1e-6):
-            raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
-    for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):
-        if not low <= q <= high:
-            raise InputError(
-                where,
-                f"needs {name} at {math.degrees(q):.1f} deg, but its joint range is"
-                f" {math.degrees(low):.1f} to {math.degrees(high):.1f} deg",
-            )
-    return dict(zip(axes, joints.tolist(), strict=True))
-
-
-def _describe_unreachable(machine: Machine, pose: np.ndarray) -> str:
-    if len(pose) == 5:
-        return f"the tool cannot reach r {pose[0]:.6g} m, z {pose[2]:.6g} m"
-    try:
-        inverse_kinematics(arm_geometry(machine), pose.tolist())
-    except UnreachableError as error:
-        return str(error)
-    return "is out of reach"

@@ -22,7 +22,7 @@ from hydrotele.control.plan import Plan
 from hydrotele.core.compiled import compiled
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 

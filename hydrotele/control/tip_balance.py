@@ -10,26 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.estimate.reduced_model import model_space, place_mechanism, reduced_model, state_size
+from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, Slot
 from hydrotele.hydraulics.circuit import actuator_friction
-from hydrotele.hydraulics.parameters import SLOT_COUNT, Slot
-from hydrotele.kinematics.task import task_jacobian
+from hydrotele.kinematics.task_space import task_jacobian
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_mechanism import (
-    BIAS,
-    DAMPING,
-    DRIFT,
-    HOME,
-    RATE,
-    ReducedMechanism,
-    ReducedMotion,
-    compute_mass_and_bias,
-    coordinate_names,
-)
+from hydrotele.multibody.reduced_dynamics import BIAS, DRIFT, RATE, ReducedMotion, compute_mass_and_bias
+from hydrotele.multibody.reduced_mechanism import DAMPING, HOME, ReducedMechanism, coordinate_names
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _VELOCITY_RANGE_RATIO = 8.0  # velocity range of a moving drive over sqrt(2 pi) times the noise
@@ -66,7 +57,7 @@ class ArmBalance(NamedTuple):
         z: (2 n + 4 h,) state of the model: positions, rates, and four values per valve, of which
             the last two are its pressures [Pa].
         joint: (m,) index of the independent coordinate of every joint, swing first.
-        task: (9,) of `kinematics.task.arm_parameters`.
+        task: (9,) of `kinematics.task_space.arm_parameters`.
         gravity: (p,) parameters of the static model [N m].
         acceleration: (n,) accelerations of the independent coordinates [rad/s^2] or [m/s^2].
         rate_noise: (n,) standard deviations of their rates [rad/s] or [m/s].

@@ -33,7 +33,7 @@ from numba.core.sigutils import normalize_signature
 from hydrotele.core.code_cache import CodeCache, cache_file_stem
 from hydrotele.core.compile_progress import CompileProgress
 from hydrotele.core.linking import Callee
-from hydrotele.core.references import argument_type
+from hydrotele.core.tuple_references import argument_type
 
 _MAX_UNUSED_AGE = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from numba.core.typing.templates import make_concrete_template
 
-from hydrotele.core.references import argument_type, check_result_type
+from hydrotele.core.tuple_references import argument_type, check_result_type
 
 MAX_INLINED_BYTECODE = 300
 """Largest bytecode length of a function whose code is copied into the caller [bytes]. LLVM seldom

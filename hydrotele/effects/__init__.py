@@ -41,7 +41,9 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_bytes, resolve_path
 from hydrotele.effects.effect import Effect, Parameter, term_parameter, with_terms, with_value
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import LAWS, DriveState, LawSource, Numbers, Term, Variable, law
+from hydrotele.terms.drive_state import DriveState
+from hydrotele.terms.law import LAWS, LawSource, Numbers, Variable, law
+from hydrotele.terms.term import Term
 
 ENTRY_POINT_GROUP = "hydrotele.effects"
 ENVIRONMENT_VARIABLE = "HYDROTELE_EFFECTS"

@@ -8,7 +8,8 @@ backlash and looseness less.
 import math
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_value
-from hydrotele.machine.machine import Machine, SensorError
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
 
 
 def _undriven_sensed_joints(machine: Machine) -> tuple[str, ...]:

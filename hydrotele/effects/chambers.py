@@ -18,7 +18,7 @@ from hydrotele.effects.effect import (
     with_value,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 _MIN_BULK_MODULUS_PA = 1.0e7  # Pa, oil full of air: the smallest bulk modulus that a machine file may state
 

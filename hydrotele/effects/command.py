@@ -9,7 +9,7 @@ from hydrotele.effects.effect import (
     with_value,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 ALL_AXES = "all"
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Balance, Term
+from hydrotele.terms.term import Balance, Term
 
 ModelPart = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
 Values = Mapping[str, float]

@@ -13,7 +13,7 @@ from hydrotele.effects.effect import (
     with_terms,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 CONSTANT_FORCE, FORCE_PULSE, SPEED_DEPENDENT_FORCE = (
     "external_force",

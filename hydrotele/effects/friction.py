@@ -23,7 +23,7 @@ from hydrotele.effects.effect import (
     with_value,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 
 def _make_friction_parameters(field: str, scale: float, high: float):

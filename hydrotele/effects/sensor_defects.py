@@ -10,7 +10,8 @@ from hydrotele.effects.effect import (
     hydraulic_axes,
     nonparallel_cylinder_axes,
 )
-from hydrotele.machine.machine import Machine, SensorError
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
 
 _NO_ERROR = SensorError()
 _SIDES = ("head", "rod")

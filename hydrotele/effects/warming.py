@@ -2,7 +2,7 @@
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 NAME, ALL_AXES = "warming", "all"
 _WARMING_TIME_S = 300.0  # s, time constant of warming of a tank of some hundred litres

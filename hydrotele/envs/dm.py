@@ -14,9 +14,10 @@ from dm_control.mujoco import engine, wrapper
 from dm_env import specs
 
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.making import make_info, make_task_core
-from hydrotele.envs.stage import FREE_CAMERA, Camera, TaskRenderer
-from hydrotele.envs.world import ObservationField
+from hydrotele.envs.gymnasium_env import make_info
+from hydrotele.envs.observation import ObservationField
+from hydrotele.envs.rendering import FREE_CAMERA, Camera, TaskRenderer
+from hydrotele.envs.task_catalogue import make_task_core
 
 FLAT_KEY = "observations"  # dm_control's key for a flat observation
 
@@ -28,7 +29,7 @@ def load(
     """Make an environment, as `dm_control.suite.load` does.
 
     Args:
-        task_name: a name in `hydrotele.envs.making.TASKS`.
+        task_name: a name in `hydrotele.envs.task_catalogue.TASKS`.
         random: seed of the episodes, or a random state from which a seed is drawn; None uses a seed
             from the operating system.
         flat_observation: whether to return all observations as one array under the key

@@ -100,7 +100,7 @@ TASK_PARAMETERS = np.dtype(
         ("fastest_pose", _F, MAX_ARM_AXES),  # pose rates at full action [m/s], [rad/s]
         ("accelerations", _F, MAX_ARM_AXES),  # acceleration limits of the pose [m/s^2], [rad/s^2]
         ("limit", _F, MAX_AXES),  # commands at full action [1], or in the drive's unit
-        ("arm", _F, 9),  # see kinematics.task.arm_parameters
+        ("arm", _F, 9),  # see kinematics.task_space.arm_parameters
         ("ranges", _F, (MAX_AXES, 2)),  # joint ranges of the axes [rad], [m]
         ("servo", _F, (MAX_AXES, 14)),  # see control.servo.servo_parameters
         ("feedforward", _F),

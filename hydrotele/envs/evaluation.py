@@ -8,8 +8,8 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
-from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.episode_batch import TaskCore
 
 SUCCESS = "success"  # name of the measure that is 1 if an episode succeeded
 

@@ -14,8 +14,9 @@ from gymnasium.spaces import Box
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.episode import SAME_STEP
-from hydrotele.envs.facts import TaskSetup
-from hydrotele.envs.making import make_action_space, make_observation_space, make_task_core
+from hydrotele.envs.gymnasium_env import make_action_space, make_observation_space
+from hydrotele.envs.task_catalogue import make_task_core
+from hydrotele.envs.task_setup import TaskSetup
 
 
 def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:

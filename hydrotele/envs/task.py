@@ -11,14 +11,15 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES
-from hydrotele.envs.world import ObservationField
-from hydrotele.kinematics.task import REACHED, compute_joint_rates, compute_tip_pose, solve_joint_angles
+from hydrotele.envs.observation import ObservationField
+from hydrotele.kinematics.task_space import REACHED, compute_joint_rates, compute_tip_pose, solve_joint_angles
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Servo, SurroundingObject
+from hydrotele.scenario.scenario import Servo
+from hydrotele.scenario.surrounding_objects import SurroundingObject
 
 ActionKind = Literal["valve", "joint_rate", "resolved_motion"]
 REAL_SENSORS = "real"
@@ -30,7 +31,7 @@ class Task:
 
     Attributes:
         name: as in `hydrotele/<Name>-v0`.
-        kind: name of its native code in `envs.facts.TASK_CODES`.
+        kind: name of its native code in `envs.task_parameters.TASK_CODES`.
         description: description of the task.
         reward: description of the reward and the termination.
         machine: name of the machine.
@@ -161,7 +162,7 @@ def compute_path_effort(f, start, change):
         The maximum effort, scalar [s]; infinite if the path leaves the workspace. Divide it by the
         duration of the path.
 
-    Source: `kinematics.task`.
+    Source: `kinematics.task_space`.
     """
     k = f.arm_axes
     pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(k), np.empty(k)
@@ -195,7 +196,7 @@ def compute_measured_pose(f, e, pose):
     Returns:
         Nothing.
 
-    Source: `kinematics.task.compute_tip_pose`.
+    Source: `kinematics.task_space.compute_tip_pose`.
     """
     compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
 

@@ -17,9 +17,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.envs.episode import MAX_AXES, MAX_CHANNELS
 from hydrotele.envs.task import Options, Task
-from hydrotele.machine.machine import Machine, SensorError
-from hydrotele.scenario.scenario import SurroundingObject
-from hydrotele.simulate.fleet import STATE_KIND
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError
+from hydrotele.scenario.surrounding_objects import SurroundingObject
+from hydrotele.simulate.batch import STATE_KIND
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import sensed_channels, start_leapfrog

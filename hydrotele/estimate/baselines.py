@@ -15,7 +15,7 @@ from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.free_run import Prepare, Runner
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.machine.signals import parse_channel
+from hydrotele.machine.log_channels import parse_channel
 
 AHEAD = 0.1  # s over which a rate is learned: a difference of two rows would be noise
 _MEMORY = 0.5  # s of commands that a model sees; hydraulic delay and lag together are shorter

@@ -41,8 +41,7 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     supply_of,
 )
-from hydrotele.hydraulics.laws import air_compliance, air_softening_factor
-from hydrotele.hydraulics.parameters import (
+from hydrotele.hydraulics.actuator_layout import (
     ADDED_DELIVERY_STATE,
     SLOT_COUNT,
     ActuatorKind,
@@ -51,11 +50,13 @@ from hydrotele.hydraulics.parameters import (
     extra_state_names,
     max_pump_drive_time_step,
 )
-from hydrotele.hydraulics.pump import STALLED_SPEED
+from hydrotele.hydraulics.laws import air_compliance, air_softening_factor
+from hydrotele.hydraulics.pump_drive import STALLED_SPEED
 from hydrotele.hydraulics.supply import TERM_FLOW_TIME_CONSTANT
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_mechanism import JOINT, solve_cholesky
-from hydrotele.terms.law import Term
+from hydrotele.multibody.reduced_dynamics import solve_cholesky
+from hydrotele.multibody.reduced_mechanism import JOINT
+from hydrotele.terms.term import Term
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion
 _USUAL_PRESSURE = 2.0e7  # Pa, of a pump's own circuit that states no relief setting

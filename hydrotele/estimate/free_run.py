@@ -26,8 +26,8 @@ from hydrotele.estimate.reduced_model import (
 )
 from hydrotele.estimate.track import DRIFT_TIME, STEP, Levels, state_scales, steps_per_row, track_run
 from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import parse_channel
 
 HORIZONS = (1.0, 5.0, 10.0, 30.0)  # s
 TO_THE_END = "end"

@@ -46,8 +46,10 @@ from hydrotele.estimate.track import (
     state_drift,
     track_run,
 )
-from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment
-from hydrotele.machine.machine import Machine, find_channel_sensor, make_channel_converter
+from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset_reduction import find_exciting_segment
+from hydrotele.machine.machine import Machine, find_channel_sensor
+from hydrotele.machine.sensors import make_channel_converter
 
 
 class LinearRun(NamedTuple):

@@ -38,7 +38,7 @@ from hydrotele.estimate.free_run import _run_from, _shown, following_levels
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import Levels, steps_per_row, track_run
-from hydrotele.kinematics.from_machine import joint_range_at_drive
+from hydrotele.kinematics.drive_linkage import joint_range_at_drive
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.drives import FlowCurve, Metering
 from hydrotele.machine.machine import Machine

@@ -12,6 +12,14 @@ import numpy as np
 
 from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
+from hydrotele.hydraulics.actuator_layout import (
+    SLOT_COUNT,
+    Slot,
+    actuator_order,
+    actuator_parameters,
+    extra_state_names,
+    machine_terms_table,
+)
 from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SCRATCH_SIZE,
@@ -26,27 +34,15 @@ from hydrotele.hydraulics.circuit import (
     write_term_state_rates,
 )
 from hydrotele.hydraulics.laws import pressure_with_released_air, pressure_without_released_air
-from hydrotele.hydraulics.parameters import (
-    SLOT_COUNT,
-    Slot,
-    actuator_order,
-    actuator_parameters,
-    extra_state_names,
-    machine_terms_table,
-)
-from hydrotele.machine.machine import Machine, SensorError, step_first_order_lag, warming_drift
-from hydrotele.machine.signals import parse_channel
-from hydrotele.multibody.reduced_mechanism import (
-    BAR,
+from hydrotele.machine.log_channels import parse_channel
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError, step_first_order_lag, warming_drift
+from hydrotele.multibody.reduced_dynamics import (
     BIAS,
-    CLOSED_LENGTH,
-    DAMPING,
     DRIFT,
-    JOINT,
     LENGTH_ROW,
     RATE,
     Q,
-    ReducedMechanism,
     ReducedMotion,
     close_loops,
     compute_bar_frames,
@@ -55,14 +51,21 @@ from hydrotele.multibody.reduced_mechanism import (
     compute_link_frames,
     compute_link_motion,
     compute_mass_and_bias,
-    coordinate_names,
     factorise_cholesky,
-    make_reduced_mechanism,
     make_reduced_motion,
     solve_cholesky,
 )
-from hydrotele.multibody.reduced_mechanism import LENGTH as BAR_LENGTH
-from hydrotele.terms.law import Drives
+from hydrotele.multibody.reduced_dynamics import LENGTH as BAR_LENGTH
+from hydrotele.multibody.reduced_mechanism import (
+    BAR,
+    CLOSED_LENGTH,
+    DAMPING,
+    JOINT,
+    ReducedMechanism,
+    coordinate_names,
+    make_reduced_mechanism,
+)
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import has_term, sum_terms_with_slope

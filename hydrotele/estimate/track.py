@@ -46,14 +46,14 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     state_names,
 )
-from hydrotele.hydraulics.circuit import circuit_scratch, compute_inlet_conditions, demanded_flow_fraction
-from hydrotele.hydraulics.parameters import (
+from hydrotele.hydraulics.actuator_layout import (
     DELIVERY_STATE,
     SLOT_COUNT,
     Slot,
     actuator_order,
     max_pump_drive_time_step,
 )
+from hydrotele.hydraulics.circuit import circuit_scratch, compute_inlet_conditions, demanded_flow_fraction
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 
 from hydrotele.core.files import models_folder
+from hydrotele.experiments.abdellatif_base_parameters import STRUCTURE
 from hydrotele.experiments.abdellatif_processing import HARMONICS, PROCESSING, average_periods
 from hydrotele.experiments.abdellatif_trials import (
     ENCODER_FEEDBACK,
@@ -30,14 +31,6 @@ from hydrotele.experiments.comparison import (
     Series,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
-    check_bootstrapped_statistic,
-    check_deterministic_value,
-    check_fraction,
-    check_mean,
-    collect_values,
-    format_values,
-)
 from hydrotele.experiments.palida import (
     PLOTTED_DRIVE,
     POSE_HIGH,
@@ -47,18 +40,24 @@ from hydrotele.experiments.palida import (
     load_excitation,
     load_robot,
     make_drive_limits,
-    plan_circle,
-    plan_square,
     simulate_excitation,
     simulate_measurement,
-    track_path,
 )
-from hydrotele.experiments.palida_base import STRUCTURE
+from hydrotele.experiments.palida_control import plan_circle, plan_square, track_path
+from hydrotele.experiments.statistical_checks import (
+    check_bootstrapped_statistic,
+    check_deterministic_value,
+    check_fraction,
+    check_mean,
+    collect_values,
+    format_values,
+)
 from hydrotele.identify.estimation import reduce_parameters
 from hydrotele.identify.excitation import Excitation, compute_information
 from hydrotele.identify.mechanism import ColumnMapping, load_mechanism
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import Regressor, project_on_drives
+from hydrotele.identify.regressor_setup import RegressorSetup
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import Regressor
 
 # Friction of the passive joints, section 2.2.
 

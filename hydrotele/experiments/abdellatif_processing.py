@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
-from hydrotele.experiments.intervals import check_bootstrapped_statistic, check_mean, collect_values
 from hydrotele.experiments.palida import (
     PLOTTED_DRIVE,
     POSE_HIGH,
@@ -25,9 +24,10 @@ from hydrotele.experiments.palida import (
     simulate_measurement,
     simulate_motion,
 )
-from hydrotele.identify.estimation import estimate_linear_parameters
+from hydrotele.experiments.statistical_checks import check_bootstrapped_statistic, check_mean, collect_values
+from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters
 from hydrotele.identify.mechanism import convert_to_given_joints
-from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.record import IdentificationRecord
 
 HARMONICS = 5

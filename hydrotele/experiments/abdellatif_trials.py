@@ -28,7 +28,19 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.palida import (
+    CHI2_LIMIT,
+    LENGTH_NOISE,
+    PUBLISHED_PARAMETERS,
+    SYMBOLS,
+    compute_force_covariance,
+    load_robot,
+    sample_force_noise,
+    simulate_excitation,
+    simulate_measurement,
+)
+from hydrotele.experiments.palida_control import compute_control_gains
+from hydrotele.experiments.statistical_checks import (
     CONFIDENCE,
     check_bootstrapped_statistic,
     check_deterministic_value,
@@ -36,19 +48,7 @@ from hydrotele.experiments.intervals import (
     check_mean,
     collect_values,
 )
-from hydrotele.experiments.palida import (
-    CHI2_LIMIT,
-    LENGTH_NOISE,
-    PUBLISHED_PARAMETERS,
-    SYMBOLS,
-    compute_control_gains,
-    compute_force_covariance,
-    load_robot,
-    sample_force_noise,
-    simulate_excitation,
-    simulate_measurement,
-)
-from hydrotele.identify.estimation import estimate_linear_parameters
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters
 
 PERIODS_PER_TRIAL = 4
 """Repetitions of the motion in one trial; the document gives no number."""

@@ -13,13 +13,14 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from hydrotele.calibrate.arm import calibrated_machine, identify_arm, identify_jointly
+from hydrotele.calibrate.arm_identification import identify_arm, identify_jointly
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, Sweep, SweepPoses
-from hydrotele.calibrate.loop import CalibrationLoop, ball_position_from_axis, build_loop, frame_after_links
-from hydrotele.control.resolved_motion import pose_to_joints
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, ball_position_from_axis, build_loop, frame_after_links
+from hydrotele.calibrate.link_sweeps import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, Sweep, SweepPoses
+from hydrotele.calibrate.machine_correction import calibrated_machine
+from hydrotele.control.arm_kinematics import pose_to_joints
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Pose
+from hydrotele.scenario.pilots import Pose
 from hydrotele.simulate.mechanism import TIP_SITE, assemble_mjcf, mjcf_document
 
 MAX_RESOLVER_ERROR = np.radians(0.1)

@@ -7,10 +7,10 @@ the thesis are in `khoshzaban_outlook`.
 
 from hydrotele.experiments import (
     khoshzaban_arm,
+    khoshzaban_calibration_claims,
     khoshzaban_dynamics,
-    khoshzaban_experiment,
     khoshzaban_machine,
-    khoshzaban_outlook,
+    khoshzaban_proposals,
 )
 from hydrotele.experiments.comparison import Series
 
@@ -29,8 +29,8 @@ SERIES = Series(
     20,
     (
         *khoshzaban_machine.EXPERIMENTS, *khoshzaban_arm.EXPERIMENTS,
-        *khoshzaban_experiment.EXPERIMENTS, *khoshzaban_dynamics.EXPERIMENTS,
-        *khoshzaban_outlook.EXPERIMENTS,
+        *khoshzaban_calibration_claims.EXPERIMENTS, *khoshzaban_dynamics.EXPERIMENTS,
+        *khoshzaban_proposals.EXPERIMENTS,
     ),
     khoshzaban_dynamics.UNAVAILABLE,
     DRAWINGS | khoshzaban_dynamics.DRAWINGS,

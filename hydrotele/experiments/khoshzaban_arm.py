@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.arm import identify_arm
-from hydrotele.calibrate.design import generate_sweep_poses
-from hydrotele.calibrate.loop import CalibrationLoop, build_loop, unit_of
+from hydrotele.calibrate.arm_identification import identify_arm
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, build_loop, unit_of
+from hydrotele.calibrate.link_sweeps import generate_sweep_poses
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
     find_true_parameters,
@@ -31,7 +31,7 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.statistical_checks import (
     MAJORITY_RANGE,
     check_bootstrapped_statistic,
     check_deterministic_value,

@@ -14,23 +14,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.arm import ArmFit, identify_arm, initial_parameters
+from hydrotele.calibrate.arm_identification import ArmFit, identify_arm, initial_parameters
 from hydrotele.calibrate.arm_poses import Poses, add_held_link_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data, predict_reading_from_others
-from hydrotele.calibrate.design import SweepPoses, generate_sweep_poses
-from hydrotele.calibrate.linkage import (
-    PARAMETER_NAMES,
-    AxisStrokes,
-    compute_angles_from_calibrator,
-    identify_linkage,
-    linkage_parameters,
-)
-from hydrotele.calibrate.loop import (
+from hydrotele.calibrate.calibration_loop import (
     CalibrationLoop,
     build_loop,
     closure_error,
     frame_after_links,
     link_chain,
+)
+from hydrotele.calibrate.link_sweeps import SweepPoses, generate_sweep_poses
+from hydrotele.calibrate.linkage_identification import (
+    PARAMETER_NAMES,
+    AxisStrokes,
+    compute_angles_from_calibrator,
+    identify_linkage,
+    linkage_parameters,
 )
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
@@ -49,7 +49,7 @@ from hydrotele.experiments.khoshzaban_arm import (
     TWIST_PARAMETERS,
     compute_rms,
 )
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.kinematics.serial_chain import chain_poses
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

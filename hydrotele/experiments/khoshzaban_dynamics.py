@@ -20,14 +20,8 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
-    check_bootstrapped_statistic,
-    check_deterministic_value,
-    check_mean,
-    collect_values,
-    format_values,
-)
-from hydrotele.experiments.khoshzaban_models import (
+from hydrotele.experiments.khoshzaban_prediction import PREDICTION
+from hydrotele.experiments.khoshzaban_regressors import (
     DRIVES,
     SAMPLE_PERIOD,
     UNITS,
@@ -39,11 +33,17 @@ from hydrotele.experiments.khoshzaban_models import (
     scale_cylinder_inertia,
     stack_rows,
 )
-from hydrotele.experiments.khoshzaban_prediction import PREDICTION
-from hydrotele.experiments.khoshzaban_sensors import (
+from hydrotele.experiments.khoshzaban_sensor_accuracy import (
     FORCE_ACCURACY,
     SENSOR_ACCURACY,
     SENSOR_NOISE_EXPERIMENT,
+)
+from hydrotele.experiments.statistical_checks import (
+    check_bootstrapped_statistic,
+    check_deterministic_value,
+    check_mean,
+    collect_values,
+    format_values,
 )
 from hydrotele.identify.identifiability import (
     STATUS_COMBINATION,

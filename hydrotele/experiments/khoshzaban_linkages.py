@@ -11,16 +11,16 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.calibrate.linkage import PARAMETER_NAMES
+from hydrotele.calibrate.linkage_identification import PARAMETER_NAMES
 from hydrotele.experiments.comparison import Claim, Evaluation, Sample
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.khoshzaban_arm import check_rms_ratio, compute_rms
+from hydrotele.experiments.khoshzaban_calibration import NO_FAULTS
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_mean,
     check_published_in_population,
     collect_values,
 )
-from hydrotele.experiments.khoshzaban_arm import check_rms_ratio, compute_rms
-from hydrotele.experiments.khoshzaban_calibration import NO_FAULTS
 
 # Table 11 (p. 76) minus the taped lengths [m], without held parameters; Table 12 (p. 77) [m].
 _PRINTED_LENGTH_ERRORS = {

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.calibrate.arm import identify_arm
-from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
-from hydrotele.calibrate.loop import CalibrationLoop, build_loop, closure_error
+from hydrotele.calibrate.arm_identification import identify_arm
+from hydrotele.calibrate.calibration_loop import CalibrationLoop, build_loop, closure_error
+from hydrotele.calibrate.link_sweeps import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.core.units import PSI
 from hydrotele.effects.effect import with_value
 from hydrotele.experiments.calibrator_readings import simulate_readings
@@ -25,13 +25,13 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_deterministic_value, collect_values
 from hydrotele.experiments.khoshzaban_arm import (
     IDENTIFIABLE_PARAMETERS,
     SIMULATED_STAGES,
 )
 from hydrotele.experiments.scenario_runs import run_shipped_scenario
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.experiments.statistical_checks import check_deterministic_value, collect_values
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

@@ -20,8 +20,7 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_bootstrapped_statistic, check_mean, format_values
-from hydrotele.experiments.khoshzaban_models import (
+from hydrotele.experiments.khoshzaban_regressors import (
     DRIVES,
     SAMPLE_PERIOD,
     UNITS,
@@ -31,20 +30,21 @@ from hydrotele.experiments.khoshzaban_models import (
     join_motions,
     make_regressor,
 )
-from hydrotele.experiments.khoshzaban_sensors import SENSOR_ACCURACY
+from hydrotele.experiments.khoshzaban_sensor_accuracy import SENSOR_ACCURACY
+from hydrotele.experiments.statistical_checks import check_bootstrapped_statistic, check_mean, format_values
 from hydrotele.identify.equations import predict_forces
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import fit_base_parameters
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
+from hydrotele.identify.optimal_smoother import smooth_and_differentiate
 from hydrotele.identify.record import IdentificationRecord, build_records
-from hydrotele.identify.setup import RegressorSetup, machine_setup
-from hydrotele.identify.smoothing import smooth_and_differentiate
+from hydrotele.identify.regressor_setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 
 FIT_SCENARIOS = ("excitation", "excitation_boom", "excitation_stick", "excitation_swing")
 """Scenarios for identification; the document has five sets of trajectories (p. 113)."""

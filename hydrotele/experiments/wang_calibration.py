@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import calibrate_hybrid_robot
+from hydrotele.calibrate.hybrid_calibration import calibrate_hybrid_robot
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
@@ -19,7 +19,7 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_fraction,
     check_mean,
@@ -36,17 +36,17 @@ from hydrotele.experiments.wang_robots import (
     make_caption_claim,
     simulate_robot,
 )
-from hydrotele.kinematics.hybrid import (
+from hydrotele.kinematics.hybrid_error_model import refined_model_parameters
+from hydrotele.kinematics.hybrid_robot import (
     HybridRobot,
     forward_kinematics,
     inverse_kinematics,
     leg_readings,
     load_hybrid,
     pose_difference,
-    refined_model_parameters,
 )
-from hydrotele.kinematics.wires import pose_covariance, pose_from_wires, wire_lengths
-from hydrotele.simulate.hybrid import default_wires, sample_poses
+from hydrotele.kinematics.wire_measurement import pose_covariance, pose_from_wires, wire_lengths
+from hydrotele.simulate.pose_measurements import default_wires, sample_poses
 
 ACCURACY_REASON = "high accuracy (±0.1 mm), page 19, RMS"
 

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.calibrate.estimation import Prior
-from hydrotele.calibrate.hybrid import (
+from hydrotele.calibrate.hybrid_calibration import (
     build_equations,
     calibrate_hybrid_robot,
     find_redundancy,
     restrict_to_fitted_parameters,
 )
-from hydrotele.calibrate.posterior import Posterior, minimize_by_evolution, sample_posterior
+from hydrotele.calibrate.posterior_sampling import Posterior, minimize_by_evolution, sample_posterior
 from hydrotele.experiments.comparison import (
     Changes,
     Check,
@@ -23,7 +23,7 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_mean,
     collect_values,
@@ -37,13 +37,9 @@ from hydrotele.experiments.wang_robots import (
     measure_nominal_robot,
     simulate_robot,
 )
-from hydrotele.kinematics.hybrid import (
-    ErrorModelKind,
-    build_error_model,
-    load_hybrid,
-    refined_model_parameters,
-)
-from hydrotele.simulate.hybrid import PLATFORM_TILT
+from hydrotele.kinematics.hybrid_error_model import ErrorModelKind, build_error_model, refined_model_parameters
+from hydrotele.kinematics.hybrid_robot import load_hybrid
+from hydrotele.simulate.pose_measurements import PLATFORM_TILT
 
 MAX_RHAT = 1.1
 """Largest split R-hat of converged chains: Gelman et al., Bayesian Data Analysis, 11.4."""

@@ -24,32 +24,26 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_deterministic_value,
     check_mean,
     format_values,
 )
 from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY
-from hydrotele.kinematics.hybrid import (
+from hydrotele.kinematics.hybrid_error_model import apply_geometry_errors, build_error_model, first_order_carriage_pose
+from hydrotele.kinematics.hybrid_robot import (
     PlatformPose,
-    apply_geometry_errors,
-    build_error_model,
     build_hybrid,
     carriage_pose,
-    first_order_carriage_pose,
     forward_kinematics,
     forward_kinematics_by_evolution,
     leg_readings,
     load_hybrid,
     pose_difference,
 )
-from hydrotele.simulate.hybrid import (
-    build_hybrid_mechanism,
-    sample_manufacturing_errors,
-    sample_poses,
-    solve_mechanism_pose,
-)
+from hydrotele.simulate.hybrid_mechanism import build_hybrid_mechanism, solve_mechanism_pose
+from hydrotele.simulate.pose_measurements import sample_manufacturing_errors, sample_poses
 
 MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above rounding errors
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import calibrate_hybrid_robot
-from hydrotele.calibrate.hybrid_data import Measurement, measurement_from_wires
+from hydrotele.calibrate.hybrid_calibration import calibrate_hybrid_robot
+from hydrotele.calibrate.hybrid_measurement import Measurement, measurement_from_wires
 from hydrotele.experiments.comparison import (
     Claim,
     Comparison,
@@ -20,19 +20,16 @@ from hydrotele.experiments.comparison import (
     Panel,
     Sample,
 )
-from hydrotele.kinematics.hybrid import (
+from hydrotele.kinematics.hybrid_error_model import (
     ErrorModel,
     ErrorModelKind,
-    HybridRobot,
     apply_geometry_errors,
     build_error_model,
-    forward_kinematics,
-    load_hybrid,
-    pose_difference,
     refined_model_parameters,
 )
-from hydrotele.kinematics.wires import wire_lengths
-from hydrotele.simulate.hybrid import (
+from hydrotele.kinematics.hybrid_robot import HybridRobot, forward_kinematics, load_hybrid, pose_difference
+from hydrotele.kinematics.wire_measurement import wire_lengths
+from hydrotele.simulate.pose_measurements import (
     PLATFORM_TILT,
     default_wires,
     sample_manufacturing_errors,

@@ -6,30 +6,30 @@ one operator, whose parameters are unknown.
 """
 
 from hydrotele.experiments import (
-    zhu_control,
+    zhu_contact_forces,
     zhu_false_force,
     zhu_felling,
-    zhu_forces,
+    zhu_free_motion,
     zhu_identification,
-    zhu_motion,
     zhu_tables,
+    zhu_theory,
 )
 from hydrotele.experiments.comparison import Experiment, Series
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    *zhu_control.EXPERIMENTS,
+    *zhu_theory.EXPERIMENTS,
     zhu_tables.TABLE_COMPARISON,
     *zhu_identification.EXPERIMENTS,
-    zhu_motion.STEERING,
-    *zhu_motion.LINES,
-    *zhu_forces.STIFFNESS_FEEDBACK,
+    zhu_free_motion.STEERING,
+    *zhu_free_motion.LINES,
+    *zhu_contact_forces.STIFFNESS_FEEDBACK,
     *zhu_felling.TIP_OVER,
-    *zhu_motion.HANDLE_RAMPS,
-    *zhu_forces.FORCE_TRACKING,
+    *zhu_free_motion.HANDLE_RAMPS,
+    *zhu_contact_forces.FORCE_TRACKING,
     *zhu_felling.FELLING,
-    *zhu_motion.STEPS,
+    *zhu_free_motion.STEPS,
     *zhu_false_force.FALSE_FORCE,
-    *zhu_forces.UNSTABLE_FEEDBACK,
+    *zhu_contact_forces.UNSTABLE_FEEDBACK,
 )
 """Experiments in the order of the document."""
 
@@ -38,5 +38,5 @@ SERIES = Series(
     "Zhu 1994, Master-slave force-reflecting resolved motion control of hydraulic mobile machines",
     20,
     EXPERIMENTS,
-    items_without_result=zhu_control.DRAWINGS | zhu_identification.DRAWINGS,
+    items_without_result=zhu_theory.DRAWINGS | zhu_identification.DRAWINGS,
 )

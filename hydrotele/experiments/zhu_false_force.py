@@ -13,21 +13,22 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.control.endpoint_force import GravityModel, endpoint_force_of_log, identify_gravity
+from hydrotele.control.endpoint_force import endpoint_force_of_log
+from hydrotele.control.gravity_model import GravityModel, identify_gravity
 from hydrotele.effects.effect import with_value
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
-from hydrotele.experiments.intervals import check_mean, collect_values, format_values
 from hydrotele.experiments.scenario_runs import make_random_operator_settings, run_shipped_scenario
+from hydrotele.experiments.statistical_checks import check_mean, collect_values, format_values
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_with_friction_shapes
 from hydrotele.identify.identified_machine import build_identified_machine
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
 from hydrotele.identify.record import build_records
-from hydrotele.identify.setup import machine_setup, map_cylinder_bodies
+from hydrotele.identify.regressor_setup import machine_setup, map_cylinder_bodies
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine import Machine
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 
 _INITIAL_ERROR_FACTOR = 1.3  # factor of masses and dry friction at the start of the identification
 _MIN_MOTION_RATIO = 3.0  # false force in motion over that at rest

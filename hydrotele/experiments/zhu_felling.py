@@ -5,21 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
-from hydrotele.experiments.intervals import (
-    check_fraction,
-    check_mean,
-    collect_values,
-    format_values,
-)
 from hydrotele.experiments.scenario_runs import (
     compute_cylindrical_pose,
     make_random_operator_settings,
     read_true_channel,
     run_shipped_scenario,
 )
+from hydrotele.experiments.statistical_checks import (
+    check_fraction,
+    check_mean,
+    collect_values,
+    format_values,
+)
 from hydrotele.run.run import Run
 from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
-from hydrotele.teleop.master import tipping_ratio
+from hydrotele.teleop.tip_over_protection import tipping_ratio
 
 JUST_NOTICEABLE_DIFFERENCE = 0.23
 """Just noticeable relative difference of a compliance without other cues (Tan 1995)."""

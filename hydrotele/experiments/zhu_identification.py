@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.control.endpoint_force import GravityModel, fit_gravity_to_masses, identify_gravity
+from hydrotele.control.gravity_model import GravityModel, fit_gravity_to_masses, identify_gravity
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
@@ -21,13 +21,13 @@ from hydrotele.experiments.comparison import (
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.scenario_runs import run_shipped_scenario
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_mean,
     collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import run_shipped_scenario
 from hydrotele.logs.log import Log
 
 _INITIAL_SAMPLES = 50  # samples from which the document computed the initial parameters

@@ -5,9 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.scenario_runs import (
+    compute_cylindrical_pose,
+    make_random_operator_settings,
+    run_shipped_scenario,
+)
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_deterministic_value,
     check_fraction,
@@ -15,18 +20,13 @@ from hydrotele.experiments.intervals import (
     collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import (
-    compute_cylindrical_pose,
-    make_random_operator_settings,
-    run_shipped_scenario,
-)
 from hydrotele.experiments.zhu_two_port import (
     ROUNDING_RANGE,
     make_claim,
     make_deterministic_experiment,
 )
-from hydrotele.kinematics.from_machine import feller_geometry
-from hydrotele.kinematics.task import (
+from hydrotele.kinematics.arm_dimensions import feller_geometry
+from hydrotele.kinematics.task_space import (
     BASE_HEIGHT,
     BASE_RADIUS,
     BOOM_LENGTH,
@@ -74,7 +74,7 @@ def compute_tool_position(g: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Compute the tool position from the Denavit-Hartenberg chains of Zhu 1994, Tables 2.1 and 2.2.
 
     Args:
-        g: (9,) geometric parameters as in `kinematics.task.arm_parameters`.
+        g: (9,) geometric parameters as in `kinematics.task_space.arm_parameters`.
         q: (4,) or (5,) joint angles [rad].
 
     Returns:

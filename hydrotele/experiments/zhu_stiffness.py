@@ -18,12 +18,12 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_deterministic_value, check_mean, collect_values
+from hydrotele.experiments.statistical_checks import check_deterministic_value, check_mean, collect_values
 from hydrotele.experiments.zhu_two_port import make_claim, make_deterministic_experiment
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.coils import make_three_station_coils
-from hydrotele.teleop.levitation import pose_resolution
-from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
+from hydrotele.teleop.optical_sensing import pose_resolution
+from hydrotele.teleop.stiffness_switching import StiffnessAxis, worst_switching_growth
 
 _TIME_STEP = 1e-3  # s
 _MIN_STIFFNESS, _MAX_STIFFNESS = (

@@ -9,7 +9,7 @@ from functools import partial
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
-from hydrotele.experiments.intervals import check_deterministic_value
+from hydrotele.experiments.statistical_checks import check_deterministic_value
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine

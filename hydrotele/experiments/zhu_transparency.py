@@ -18,7 +18,12 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_deterministic_value, check_mean, collect_values, format_values
+from hydrotele.experiments.statistical_checks import (
+    check_deterministic_value,
+    check_mean,
+    collect_values,
+    format_values,
+)
 from hydrotele.experiments.zhu_two_port import (
     HAND_FREQUENCIES,
     NOTICEABLE_DIFFERENCE,
@@ -32,16 +37,11 @@ from hydrotele.experiments.zhu_two_port import (
     make_deterministic_experiment,
     make_identical_sides_case,
 )
-from hydrotele.teleop.analysis import TeleoperatorAxis, find_first_change, is_strictly_stable
-from hydrotele.teleop.time_simulation import compare_stability
-from hydrotele.teleop.two_port import (
-    Impedance,
-    TwoPort,
-    count_unstable_poles,
-    hybrid_matrix,
-    scattering_norm,
-    transmitted_impedance,
-)
+from hydrotele.teleop.case_file import TeleoperatorAxis
+from hydrotele.teleop.linear_analysis import find_first_change, is_strictly_stable
+from hydrotele.teleop.nyquist_criterion import count_unstable_poles
+from hydrotele.teleop.simulation_check import compare_stability
+from hydrotele.teleop.two_port import Impedance, TwoPort, hybrid_matrix, scattering_norm, transmitted_impedance
 
 # --- p. 37 to 43: transparency under position control ---------------------------------------------
 

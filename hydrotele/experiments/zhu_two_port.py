@@ -22,14 +22,20 @@ from hydrotele.experiments.comparison import (
     Sample,
     merge_settings,
 )
-from hydrotele.experiments.intervals import check_deterministic_value, check_mean, collect_values, format_values
 from hydrotele.experiments.scenario_runs import (
     make_random_operator_settings,
     read_true_channel,
     run_shipped_scenario,
 )
-from hydrotele.teleop.analysis import TeleoperatorAxis, find_gain_margin, load_teleop_case
-from hydrotele.teleop.time_simulation import compare_stability
+from hydrotele.experiments.statistical_checks import (
+    check_deterministic_value,
+    check_mean,
+    collect_values,
+    format_values,
+)
+from hydrotele.teleop.case_file import TeleoperatorAxis, load_teleop_case
+from hydrotele.teleop.linear_analysis import find_gain_margin
+from hydrotele.teleop.simulation_check import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
     TwoPort,

@@ -25,6 +25,7 @@ from hydrotele.estimate.reduced_model import (
     place,
     reduced_model,
 )
+from hydrotele.hydraulics.actuator_layout import PUMP_OFFSET, actuator_order, actuator_parameters
 from hydrotele.hydraulics.circuit import (
     SLOT_COUNT,
     Slot,
@@ -39,28 +40,19 @@ from hydrotele.hydraulics.circuit import (
     demanded_flow_fraction,
 )
 from hydrotele.hydraulics.laws import air_compliance, air_softening_factor, relief_and_makeup_flow, spool_step
-from hydrotele.hydraulics.parameters import PUMP_OFFSET, actuator_order, actuator_parameters
-from hydrotele.hydraulics.pump import load_cylinder_force, load_pressure_step
+from hydrotele.hydraulics.pump_drive import load_cylinder_force, load_pressure_step
 from hydrotele.hydraulics.supply import drawn_flow, max_supply_pressure
-from hydrotele.identify import smoothing
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.identify import optimal_smoother
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.kinematics.linkages import LoopOpenError
+from hydrotele.logs.clock import fit_clock
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import fit_clock
-from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
-from hydrotele.machine.signals import default_channel_unit, parse_channel
-from hydrotele.multibody.reduced_mechanism import (
-    BAR,
-    BIAS,
-    DAMPING,
-    DRIFT,
-    JOINT,
-    LENGTH_BIAS,
-    LENGTH_ROW,
-    RATE,
-    compute_mass_and_bias,
-)
+from hydrotele.machine.log_channels import default_channel_unit, parse_channel
+from hydrotele.machine.machine import Machine, get_sensor_set, reading_noise_rms
+from hydrotele.machine.sensors import SensorError
+from hydrotele.multibody.reduced_dynamics import BIAS, DRIFT, LENGTH_BIAS, LENGTH_ROW, RATE, compute_mass_and_bias
+from hydrotele.multibody.reduced_mechanism import BAR, DAMPING, JOINT
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
 _PORT, _KR = int(Slot.PORT_RELIEF), int(Slot.RELIEF_GAIN)
@@ -294,9 +286,9 @@ def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping
         sigma = sigma / error.scale or None
         if len(known) < _LEAST_READINGS or (sigma is None and np.ptp(known) == 0.0):
             continue
-        motion = smoothing.smooth_and_differentiate(on_clock[:, None], clock.period, sigma)
+        motion = optimal_smoother.smooth_and_differentiate(on_clock[:, None], clock.period, sigma)
         best = np.stack([motion.value, motion.rate, motion.acceleration])[None, :, :, 0]
-        draws = smoothing.sample_smoothing_errors(motion, DRAWS, k)[..., 0]
+        draws = optimal_smoother.sample_smoothing_errors(motion, DRAWS, k)[..., 0]
         reading[name], found[name] = on_clock, float(motion.noise[0])
         smoothed[name] = np.concatenate([best, best + draws])
     return Signals(time, clock.period, command, reading, found, smoothed)

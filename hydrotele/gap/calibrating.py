@@ -41,7 +41,8 @@ from hydrotele.estimate.output_error import (
 from hydrotele.estimate.track import COARSE
 from hydrotele.gap.result import Estimate
 from hydrotele.gap.screening import Screened
-from hydrotele.logs.dataset import Dataset, RunData, downsample
+from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset_reduction import downsample
 from hydrotele.machine.machine import Machine
 
 _NORMAL95 = 1.96

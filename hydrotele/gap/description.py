@@ -29,8 +29,8 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import DRIVE_VARIABLES
 from hydrotele.terms.table import SWITCH
+from hydrotele.terms.term import DRIVE_VARIABLES
 
 _PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play
 _FRONT_WORDS = {

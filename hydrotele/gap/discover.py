@@ -47,10 +47,10 @@ from hydrotele.gap.law_tables import (
 from hydrotele.gap.rivals import ENTER
 from hydrotele.gap.screening import busy_window
 from hydrotele.gap.search import lacking
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import DRIVE_VARIABLES, Term
+from hydrotele.terms.term import DRIVE_VARIABLES, Term
 
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""

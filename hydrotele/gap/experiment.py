@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from hydrotele.core.files import models_folder, resolve_path
-from hydrotele.kinematics import five_dof
+from hydrotele.kinematics import feller_arm
 from hydrotele.kinematics.arm import forward_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
+from hydrotele.kinematics.arm_dimensions import arm_geometry, feller_geometry
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.machine.machine import Machine
 
 _MARGIN = 0.06  # of a joint's range that is left at each end, for overshoot
@@ -142,7 +143,7 @@ def _height(machine: Machine, pose: Mapping[str, float]) -> float:
     if arm.head:
         feller = feller_geometry(machine)
         elbow = feller.base_height + feller.boom_length * math.sin(of_joint[arm.boom])
-        return min(elbow, five_dof.forward_kinematics(feller, q).z)
+        return min(elbow, feller_arm.forward_kinematics(feller, q).z)
     geometry = arm_geometry(machine)
     elbow = geometry.boom_pin_height + geometry.boom_length * math.sin(of_joint[arm.boom])
     return min(elbow, forward_kinematics(geometry, q)[2])

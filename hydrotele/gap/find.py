@@ -54,9 +54,10 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.logs.dataset import Dataset, downsample, select_exciting_segments
+from hydrotele.logs.dataset import Dataset
+from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
+from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import parse_channel
 
 PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`

@@ -19,8 +19,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.estimate.track import Track, error_responses
-from hydrotele.terms.law import DRIVE_VARIABLES
 from hydrotele.terms.table import PLAY, SWITCH, update_hysteresis, window_factor
+from hydrotele.terms.term import DRIVE_VARIABLES
 
 THROUGH = "flow_through"
 """Balance of a flow from the head side to the rod side."""

@@ -24,17 +24,17 @@ from hydrotele.identify.equations import (
     low_pass_forces,
     predict_forces,
 )
+from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.mechanism import Mechanism, convert_to_given_joints
-from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.record import (
     IdentificationRecord,
     correct_sensor_error,
     trim_missing_positions,
 )
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.machine.machine import SensorError
+from hydrotele.identify.regressor_setup import RegressorSetup
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 STRIBECK = (0.03, 0.1, 0.3)  # of a joint's RMS rate: Stribeck velocities that are tried
 _DRY = ("coulomb", "stribeck")  # terms of dry friction

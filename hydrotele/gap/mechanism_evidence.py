@@ -21,9 +21,10 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
-from hydrotele.identify.estimation import compute_weights, estimate_error_variances, fit_autoregression
+from hydrotele.identify.estimation import compute_weights, estimate_error_variances
+from hydrotele.identify.linear_least_squares import fit_autoregression
 from hydrotele.identify.mechanism import Mechanism
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 _POINTS, _FINE, _GRID = 10, 40, 7  # of hat functions along one variable; of a grid of two
 _RIDGE = 1e-3

@@ -66,7 +66,7 @@ from hydrotele.gap.result import (
 )
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 _ODDS = 6.0  # twice the log odds by which naming an effect must beat not naming it, beside the
 # number of effects that are tried

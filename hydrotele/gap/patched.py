@@ -24,10 +24,10 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.identify.mechanism import ColumnMapping
-from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import Chain, body_inertial_parameters
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 EFFECTS_FILE = "effects.yaml"
 

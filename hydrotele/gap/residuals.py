@@ -33,8 +33,8 @@ from hydrotele.estimate.reduced_model import model_space, reduced_model, simulat
 from hydrotele.estimate.track import STEP, Track, track_run
 from hydrotele.gap.result import LearnedLaw, NamedEffect
 from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import parse_channel
 
 _EXPECTED = (1.0, 1.0, 0.0)  # of white noise of size 1, in the order of LIMITS
 ALLOWED = 5.0  # times what the filter leaves on simulated readings, which varies by two

@@ -19,6 +19,7 @@ import numpy as np
 from numba import types
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.contiguous_state import flat_view, make_contiguous_state
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.haptics.device import HandlePose
@@ -47,13 +48,7 @@ from hydrotele.haptics.packets import (
     make_packet,
 )
 from hydrotele.haptics.timing import request_realtime_priority, summarise_durations
-from hydrotele.teleop.axis_table import (
-    COORDINATE,
-    DEADBAND,
-    HANDLE_RANGE,
-    flat_view,
-    make_contiguous_state,
-)
+from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, HANDLE_RANGE
 from hydrotele.teleop.master import (
     REFLECTION_KINDS,
     MasterParameters,

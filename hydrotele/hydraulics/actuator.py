@@ -20,9 +20,9 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 import math
 
 from hydrotele.core.compiled import compile_inlined, compile_without_allocation
+from hydrotele.hydraulics.actuator_layout import PUMP_OFFSET, ActuatorKind, Slot
 from hydrotele.hydraulics.laws import end_stop_force, friction_force, friction_slope
-from hydrotele.hydraulics.parameters import PUMP_OFFSET, ActuatorKind, Slot
-from hydrotele.hydraulics.pump import load_cylinder_force, pump_piston_friction, pump_pressure_rates
+from hydrotele.hydraulics.pump_drive import load_cylinder_force, pump_piston_friction, pump_pressure_rates
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _VH, _VR = int(Slot.VOLUME_HEAD), int(Slot.VOLUME_ROD)

@@ -26,18 +26,16 @@ from hydrotele.hydraulics.actuator import (
     pump_drive_pressure_rates,
     pump_drive_volumes,
 )
+from hydrotele.hydraulics.actuator_layout import PUMP_OFFSET, SLOT_COUNT, ActuatorKind, Slot
 from hydrotele.hydraulics.laws import (
     air_compliance,
     air_softening_factor,
-    axis_valve_opening,
-    chamber_flows,
     pressure_with_released_air,
     pressure_without_released_air,
     relief_and_makeup_flow,
     spool_step,
 )
-from hydrotele.hydraulics.parameters import PUMP_OFFSET, SLOT_COUNT, ActuatorKind, Slot
-from hydrotele.hydraulics.pump import (
+from hydrotele.hydraulics.pump_drive import (
     load_pressure_step,
     pump_flows,
     pump_speed_after_switching,
@@ -55,7 +53,8 @@ from hydrotele.hydraulics.supply import (
     pump_flow_fraction,
     solve_supply_pressure,
 )
-from hydrotele.terms.law import VARIABLES, DriveState
+from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
+from hydrotele.terms.drive_state import VARIABLES, DriveState
 from hydrotele.terms.table import (
     ANY_DRIVE,
     COMMAND,

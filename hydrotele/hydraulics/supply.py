@@ -7,8 +7,8 @@ Flat arrays have the layout described in `circuit`; `ports` has four values per 
 import math
 
 from hydrotele.core.compiled import compile_inlined, compile_without_allocation
-from hydrotele.hydraulics.laws import axis_valve_opening, inlet_flow, inlet_gain
-from hydrotele.hydraulics.parameters import SLOT_COUNT, ActuatorKind, Slot
+from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, ActuatorKind, Slot
+from hydrotele.hydraulics.valve import axis_valve_opening, inlet_flow, inlet_gain
 
 _MAX_NEWTON_STEPS = 60
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the documented flow balance of 1e-6

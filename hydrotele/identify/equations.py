@@ -13,17 +13,18 @@ import numpy as np
 from scipy.signal import upfirdn
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.motion import (
+from hydrotele.identify.joint_motion import (
     MAX_GAP_S,
     Processing,
     Resolution,
     compute_joint_motion,
     propagate_rate_std,
 )
+from hydrotele.identify.optimal_smoother import sample_smoothing_errors, smooth_and_differentiate
 from hydrotele.identify.record import IdentificationRecord
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import SmoothedSignal, sample_smoothing_errors, smooth_and_differentiate
-from hydrotele.multibody.inverse_dynamics import Regressor, friction_sign_std
+from hydrotele.identify.regressor_setup import RegressorSetup
+from hydrotele.identify.smoothed_signal import SmoothedSignal
+from hydrotele.multibody.regressor import Regressor, friction_sign_std
 
 _HALF_LENGTH_PERIODS = 1.5  # half length of the low-pass filter, in periods of its cutoff
 _KAISER_BETA = 5.0  # window parameter: ripple of -50 dB

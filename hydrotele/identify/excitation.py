@@ -14,9 +14,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.identify.identifiability import classify_noisy_parameters, reference_sizes
-from hydrotele.identify.setup import RegressorSetup
+from hydrotele.identify.regressor_setup import RegressorSetup
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.inverse_dynamics import Projection
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.identify.estimation import Estimate
-from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
+from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
+from hydrotele.identify.linear_least_squares import Estimate
 from hydrotele.identify.record import IdentificationRecord
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import DEVIATION_TERMS
+from hydrotele.identify.regressor_setup import RegressorSetup
+from hydrotele.multibody.regressor import DEVIATION_TERMS
 
 _DEVIATION_SPEEDS = (1 / 32, 1 / 16, 1 / 8, 1 / 4)  # of the RMS speed: widths of the deviations near zero speed
 _REST_SPEED = 0.002  # of the RMS speed: smaller than any speed but for an instant at a reversal

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, is_friction_deviation
+from hydrotele.identify.regressor_setup import RegressorSetup
+from hydrotele.multibody.regressor import BODY_PARAMETERS, Regressor, is_friction_deviation
 
 STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL = "unidentifiable", "combination", "full"
 STATUS_WEAK = "weak"  # influence below the noise

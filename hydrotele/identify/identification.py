@@ -28,7 +28,6 @@ from hydrotele.identify.equations import (
 )
 from hydrotele.identify.estimation import (
     METHODS_WITH_PERIOD,
-    Estimate,
     Estimator,
     WeightedEquations,
     compute_weights,
@@ -42,22 +41,24 @@ from hydrotele.identify.friction import (
     set_rest_speeds,
 )
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
-from hydrotele.identify.motion import (
+from hydrotele.identify.joint_motion import (
     Processing,
     Resolution,
     apply_filter_adjoint,
     compute_joint_motion,
     estimate_resolution,
 )
+from hydrotele.identify.linear_least_squares import Estimate
+from hydrotele.identify.optimal_smoother import smooth_and_differentiate
 from hydrotele.identify.record import (
     IdentificationRecord,
     check_periodicity,
     cut_to_whole_cycles,
     keep_beginning,
 )
+from hydrotele.identify.regressor_setup import RegressorSetup
 from hydrotele.identify.result import Identification
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import SmoothedSignal, smooth_and_differentiate
+from hydrotele.identify.smoothed_signal import SmoothedSignal
 from hydrotele.identify.verdict import (
     assess_identification,
     compute_heldout_errors,

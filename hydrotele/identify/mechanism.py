@@ -16,21 +16,21 @@ from pydantic import Field
 
 from hydrotele.core.datafile import StrictModel, read_yaml, suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
-from hydrotele.identify.motion import MAX_GAP_S
+from hydrotele.identify.joint_motion import MAX_GAP_S
 from hydrotele.identify.record import (
     IdentificationRecord,
     correct_sensor_error,
     trim_missing_positions,
 )
-from hydrotele.identify.setup import RegressorSetup, mechanism_setup
+from hydrotele.identify.regressor_setup import RegressorSetup, mechanism_setup
+from hydrotele.logs.clock import fit_clock
 from hydrotele.logs.log import SKIP_COLUMN, Log, find_logs, load_log
-from hydrotele.logs.rows import fit_clock
 from hydrotele.logs.table import read_table
-from hydrotele.machine.machine import SensorError
-from hydrotele.machine.signals import suggest_channel_names
+from hydrotele.machine.log_channels import suggest_channel_names
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.closures import solve_joint_positions
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
+from hydrotele.multibody.closed_chain_kinematics import solve_joint_positions
+from hydrotele.multibody.regressor import BODY_PARAMETERS, FRICTION_TERMS
 
 _FIT_FRACTION = 2.0 / 3.0  # fitted fraction of a single run; the remainder is for validation
 _POSITION_PATTERNS = ("position.{joint}", "angle.{joint}", "{joint}")

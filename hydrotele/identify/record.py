@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
+from hydrotele.hydraulics.actuator_layout import actuator_order
+from hydrotele.kinematics.drive_linkage import DriveLinkage, axis_linkage
 from hydrotele.kinematics.linkages import LoopOpenError
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.machine.machine import Machine, get_sensor_set, reading_noise_rms
+from hydrotele.machine.sensors import SensorError
 
 _ERROR_CONTEXT = "identification"
 _MAX_CYCLE_DRIFT_ROWS = 0.5  # rows, largest shift of a cycle against the rows over a whole record

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.friction import FrictionForce
 from hydrotele.identify.identifiability import (
     STATUS_COMBINATION,
@@ -14,7 +13,8 @@ from hydrotele.identify.identifiability import (
     STATUS_WEAK,
     Identifiability,
 )
-from hydrotele.multibody.inverse_dynamics import is_friction_deviation
+from hydrotele.identify.linear_least_squares import Estimate
+from hydrotele.multibody.regressor import is_friction_deviation
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 import numpy as np
 
 from hydrotele.identify.equations import Equations
-from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import Identifiability
+from hydrotele.identify.linear_least_squares import Estimate
+from hydrotele.identify.regressor_setup import RegressorSetup
 from hydrotele.identify.result import HeldOutError, HeldOutForces
-from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
+from hydrotele.multibody.regressor import FRICTION_TERMS, Regressor
 
 _MAX_ERROR_OVER_NOISE = 1.5  # prediction error over noise above which the model is incomplete
 _MAX_ERROR_OVER_RESIDUAL = 3.0  # prediction error over fitted residuals above which the model is overfitted

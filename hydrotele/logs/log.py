@@ -18,10 +18,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file
 from hydrotele.core.units import canonical_unit, si_unit_and_factor
-from hydrotele.logs.stamps import repair_time_stamps
 from hydrotele.logs.table import DATE_UNIT, Table, parse_label, read_table
-from hydrotele.machine import signals
-from hydrotele.machine.signals import (
+from hydrotele.logs.time_stamps import repair_time_stamps
+from hydrotele.machine import log_channels
+from hydrotele.machine.log_channels import (
     allowed_channel_units,
     default_channel_unit,
     parse_channel,
@@ -290,7 +290,7 @@ class Log:
         if self.time.ndim != 1 or self.columns.keys() != self.units.keys():
             raise ValueError("time must be (n,), and columns and units must have the same keys")
         for name, values in self.columns.items():
-            allowed = signals.allowed_channel_units(name)
+            allowed = log_channels.allowed_channel_units(name)
             if name == "time" or values.shape != self.time.shape or self.units[name] not in allowed:
                 expected = f"{self.time.shape} in {' or '.join(allowed)}"
                 raise ValueError(f"{name}: expected {expected}, got {values.shape} in {self.units[name]!r}")
@@ -323,7 +323,7 @@ class Log:
     @property
     def axes(self) -> tuple[str, ...]:
         """Axes of the measured channels, in order of appearance."""
-        channels = map(signals.parse_channel, self.columns)
+        channels = map(log_channels.parse_channel, self.columns)
         return tuple(dict.fromkeys(c.axis for c in channels if c.axis and not c.truth))
 
     @property
@@ -357,7 +357,7 @@ class Log:
 
     def without_truth(self) -> "Log":
         """Return the log without the `truth.*` channels, which only a simulator knows."""
-        kept = [name for name in self.columns if not signals.parse_channel(name).truth]
+        kept = [name for name in self.columns if not log_channels.parse_channel(name).truth]
         return replace(self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept})
 
 

@@ -182,7 +182,7 @@ class Valve(StrictModel):
     over the inlet edge never exceeds `compensated_drop` [Pa] (by default the rated drop). The flow
     is then independent of the load, as long as the supply pressure suffices. `tank_leakage`
     [m^3/(s Pa)] is the laminar leakage from each work port to tank, through the radial clearance of
-    the spool (`hydraulics.laws.chamber_flows`). `positive` and `negative` describe the two
+    the spool (`hydraulics.valve.chamber_flows`). `positive` and `negative` describe the two
     directions of travel; a positive command feeds the head side.
     """
 

@@ -14,21 +14,17 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import parse_json
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
-from hydrotele.machine.signals import default_channel_unit
-from hydrotele.scenario.scenario import read_soil_from_log
-from hydrotele.simulate.feedback import apply_sensor_errors
+from hydrotele.machine.log_channels import default_channel_unit
+from hydrotele.machine.machine import Machine, get_sensor_set, reading_noise_rms
+from hydrotele.machine.sensors import SensorError
+from hydrotele.scenario.surrounding_objects import read_soil_from_log
 from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.record import (
-    Record,
-    Recorder,
-    delayed_channels,
-    start_leapfrog,
-    true_channels,
-)
+from hydrotele.simulate.record import Record, Recorder, start_leapfrog
+from hydrotele.simulate.sensor_models import apply_sensor_errors
 from hydrotele.simulate.stepping import Stepper
 from hydrotele.simulate.surroundings import Surroundings
+from hydrotele.simulate.true_values import delayed_channels, true_channels
 
 COMPARED_KINDS = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 

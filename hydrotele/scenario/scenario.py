@@ -6,133 +6,28 @@ may have units as suffixes, as in machine files.
 """
 
 import copy
-import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from hydrotele.core.datafile import (
     Name,
     NonNegativeFloat,
     PositiveFloat,
     StrictModel,
-    Vector,
     parse_yaml_value,
     read_yaml,
     suggest_valid_name,
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import describe_excess, resolve_path, scenarios_folder
-from hydrotele.logs.log import Log, load_log
-from hydrotele.machine.signals import parse_channel
-from hydrotele.scenario.teleoperation import TeleopPilot
-
-
-class Plate(StrictModel):
-    """A plate on a spring and a damper that the tool can press: an environment of known stiffness.
-
-    `position` [m] is the centre of its face and `normal` the outward normal of the face (z is up,
-    -x points back to the machine). `size` holds the half sizes [m]; further keys are mass [kg],
-    stiffness [N/m] and damping [N s/m].
-    """
-
-    kind: Literal["plate"] = "plate"
-    position: Vector
-    normal: Literal["x", "-x", "y", "-y", "z"] = "z"
-    size: tuple[PositiveFloat, PositiveFloat] = (1.0, 1.0)
-    mass: PositiveFloat = 300.0
-    stiffness: PositiveFloat = 1.0e6
-    damping: NonNegativeFloat = 3.0e4
-
-
-class StandingTree(StrictModel):
-    """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
-
-    `position` [m] is on the ground, `cut_height` [m] the height of the cut, and
-    `cutting_energy` [J/m^3] the energy per cut volume. `saw` and `grab` are axes of the machine; a
-    grab at more than `closed_angle` [rad] holds a stem in its pocket.
-    """
-
-    renamed = {"kerf": "cut_height", "energy": "cutting_energy", "closed": "closed_angle"}
-
-    kind: Literal["tree"] = "tree"
-    position: tuple[float, float]
-    diameter: PositiveFloat = 0.34
-    height: PositiveFloat = 9.0
-    density: PositiveFloat = 750.0
-    cut_height: PositiveFloat = 0.30
-    cutting_energy: PositiveFloat = 2.0e7
-    saw: Name = "saw"
-    grab: Name = "grab"
-    closed_angle: float = 1.0
-
-
-class LogOnGround(StrictModel):
-    """A log on the ground that a grapple picks up and puts down.
-
-    `position` [m] is its centre, and `direction` [rad] the angle of its axis in the horizontal
-    plane, 0 along x; diameter and length are in [m], density in [kg/m^3]. `grab` is the axis of the
-    machine that closes the jaw. A log in the pocket is gripped at more than `closed_angle` [rad]
-    and released at less than `open_angle` [rad].
-    """
-
-    renamed = {"closed": "closed_angle", "open": "open_angle"}
-
-    kind: Literal["log"] = "log"
-    position: tuple[float, float]
-    direction: float = 0.0
-    diameter: PositiveFloat = 0.35
-    length: PositiveFloat = 4.0
-    density: PositiveFloat = 830.0
-    grab: Name = "claw"
-    closed_angle: float = 1.2
-    open_angle: float = 1.0
-
-    @model_validator(mode="after")
-    def _check(self):
-        if self.open_angle > self.closed_angle:
-            raise ValueError(
-                f"open_angle {self.open_angle:g} rad must not exceed closed_angle {self.closed_angle:g} rad"
-            )
-        if self.length < 2.0 * self.diameter:
-            raise ValueError(f"length {self.length:g} m must be at least twice the diameter {self.diameter:g} m")
-        return self
-
-    @property
-    def mass(self) -> float:
-        """Mass of the log [kg]."""
-        return self.density * math.pi * self.diameter**2 / 4.0 * self.length
-
-
-class SoilGround(StrictModel):
-    """Ground that the bucket of the machine can dig up: a strip of soil in the plane of the arm.
-
-    `soil` selects the soil's strength parameters by name. Other links of the machine touch firm
-    ground.
-    """
-
-    kind: Literal["soil"] = "soil"
-    soil: Literal["soft", "sandy_loam", "firm"] = "sandy_loam"
-
-
-SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround, Field(discriminator="kind")]
-
-
-class Pose(StrictModel):
-    """Pose of the arm's tip in cylindrical coordinates about the swing axis.
-
-    `r` is the distance from the axis and `z` the height above ground [m]. `theta` is the swing angle,
-    `attitude` the pitch of the tool and `head` its rotation [rad]; not all arms have the last two.
-    """
-
-    r: PositiveFloat
-    z: float
-    theta: float = 0.0
-    attitude: float | None = None
-    head: float | None = None
+from hydrotele.core.files import resolve_path, scenarios_folder
+from hydrotele.logs.log import load_log
+from hydrotele.machine.log_channels import parse_channel
+from hydrotele.scenario.pilots import Pilot, Pose, TablePilot, check_size_limit
+from hydrotele.scenario.surrounding_objects import SurroundingObject
 
 
 class StartState(StrictModel):
@@ -143,156 +38,6 @@ class StartState(StrictModel):
 
     joints: dict[Name, float] = {}
     pose: Pose | None = None
-
-
-class ConstantPilot(StrictModel):
-    """Constant commands to valves or drives, open loop: axis -> command [1] or [V]."""
-
-    kind: Literal["constant"]
-    commands: dict[Name, float] = {}
-
-
-class TablePilot(StrictModel):
-    """Commands or references from a table over time, given as columns or in a log file.
-
-    `quantity: command` drives the valves open loop, `quantity: joint` gives joint references [rad]
-    or [m]. `file` is a CSV or Parquet log, of which the columns `command.<axis>` or
-    `reference.<axis>` (otherwise `angle.<axis>`, `position.<axis>`) are used. `interpolate` holds
-    the last value or connects the values linearly.
-    """
-
-    renamed = {"of": "quantity"}
-
-    kind: Literal["table"]
-    quantity: Literal["command", "joint"] = "command"
-    time: list[NonNegativeFloat] = []
-    columns: dict[Name, list[float]] = {}
-    file: str | None = None
-    interpolate: Literal["hold", "linear"] = "hold"
-
-    @model_validator(mode="after")
-    def _check(self):
-        if bool(self.file) == bool(self.columns):
-            raise ValueError("give either columns (with time) or file")
-        for name, values in self.columns.items():
-            if len(values) != len(self.time):
-                raise ValueError(f"columns.{name} has {len(values)} values, time has {len(self.time)}")
-        if self.columns and (not self.time or self.time[0] != 0.0 or any(_find_nonrising_steps(self.time))):
-            raise ValueError("time must start at 0 and rise strictly")
-        return self
-
-
-def _find_nonrising_steps(values) -> list[bool]:
-    return [b <= a for a, b in zip(values, values[1:], strict=False)]
-
-
-def _check_size_limit(name: str, amount: float) -> None:
-    if said := describe_excess(name, amount):
-        raise ValueError(f"has {said}")
-
-
-class FourierSeries(StrictModel):
-    """Fourier series of one joint's reference: `mean + sum_k (sin_k sin(k w t) + cos_k cos(k w t))`.
-
-    k counts from 1, w is 2 pi over the common period, and all coefficients are in [rad] or [m].
-    """
-
-    mean: float = 0.0
-    sin: list[float] = []
-    cos: list[float] = []
-
-
-class FourierPilot(StrictModel):
-    """Periodic joint references as Fourier series with a common `period` [s].
-
-    They are faded in from the start position over `fade` [s].
-
-    The servo holds axes without a reference at their start, except those in `closed_valves`, whose
-    command is always 0.
-    """
-
-    kind: Literal["fourier"]
-    period: PositiveFloat
-    fade: NonNegativeFloat = 2.0
-    axes: dict[Name, FourierSeries]
-    closed_valves: tuple[Name, ...] = ()
-
-    @model_validator(mode="after")
-    def _check(self):
-        if both := sorted(set(self.closed_valves) & self.axes.keys()):
-            raise ValueError(f"closed_valves: {both[0]} also has a reference in axes; name it in one of them")
-        counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
-        _check_size_limit("HARMONICS", max(counts, default=0))
-        return self
-
-
-class TipMove(StrictModel):
-    """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad].
-
-    `speed` is that of the tip [m/s], or [rad/s] if only angles change; `pause` [s] follows the move.
-    """
-
-    r: float = 0.0
-    z: float = 0.0
-    theta: float = 0.0
-    attitude: float = 0.0
-    head: float = 0.0
-    speed: Annotated[float, Field(ge=1e-4, le=100)] = 0.5
-    pause: NonNegativeFloat = 0.5
-
-
-class LinesPilot(StrictModel):
-    """Straight moves of the tip in cylindrical coordinates, converted to joint references.
-
-    `mode: rate` integrates rate commands like those of a joystick under rate control; `position`
-    commands the pose. The tip rests for `settle` [s] and then makes the `moves`, whose speeds are
-    reached with `acceleration` [m/s^2] or [rad/s^2].
-    """
-
-    kind: Literal["lines"]
-    mode: Literal["rate", "position"] = "rate"
-    settle: NonNegativeFloat = 1.0
-    acceleration: Annotated[float, Field(ge=1e-3, le=1000)] = 1.0
-    moves: Annotated[list[TipMove], Field(min_length=1)]
-
-    @model_validator(mode="after")
-    def _check(self):
-        _check_size_limit("MOVES", len(self.moves))
-        return self
-
-
-class Waypoint(StrictModel):
-    """Joint positions or tip pose, reached `duration` [s] after the previous one, held `pause` [s].
-
-    `joints` are joint name -> position [rad] or [m].
-    """
-
-    duration: PositiveFloat
-    pause: NonNegativeFloat = 0.0
-    joints: dict[Name, float] = {}
-    pose: Pose | None = None
-
-
-class WaypointsPilot(StrictModel):
-    """Waypoints connected by quintic polynomials of time, in joint space or in the tip pose.
-
-    The motion starts after `settle` [s].
-    """
-
-    kind: Literal["waypoints"]
-    settle: NonNegativeFloat = 0.5
-    points: Annotated[list[Waypoint], Field(min_length=1)]
-
-    @model_validator(mode="after")
-    def _check(self):
-        _check_size_limit("MOVES", len(self.points))
-        return self
-
-
-Pilot = Annotated[
-    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot | TeleopPilot,
-    Field(discriminator="kind"),
-]
 
 
 class Servo(StrictModel):
@@ -368,8 +113,8 @@ class Scenario(StrictModel):
         ticks = self.control_rate / self.log_rate
         if ticks < 0.999 or abs(ticks - round(ticks)) > 1e-6:
             raise ValueError(f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz")
-        _check_size_limit("RUN_TICKS", self.duration * self.control_rate)
-        _check_size_limit("RUN_ROWS", self.duration * self.log_rate)
+        check_size_limit("RUN_TICKS", self.duration * self.control_rate)
+        check_size_limit("RUN_ROWS", self.duration * self.log_rate)
         if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
             raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
         if sum(thing.kind == "soil" for thing in self.surroundings) > (1 if self.ground else 0):
@@ -551,19 +296,3 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
         where[parts[-1]] = value
     else:
         raise InputError(f"--set {key}", "there is nothing to set at this key")
-
-
-def read_soil_from_log(log: Log) -> tuple[SoilGround, ...]:
-    """Read from a log's metadata the soil that the bucket could dig during the run.
-
-    The result contains one soil, or is empty if the run had none.
-
-    Raises:
-        InputError: the metadata are damaged.
-    """
-    if "soil" not in log.metadata:
-        return ()
-    try:
-        return (SoilGround.model_validate_json(log.metadata["soil"]),)
-    except ValidationError as error:
-        raise InputError(f"{log.source}: metadata soil", f"is invalid: {error.errors()[0]['msg']}") from None

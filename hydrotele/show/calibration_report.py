@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 import hydrotele
-from hydrotele.calibrate.arm import ArmFit, stage_residuals
+from hydrotele.calibrate.arm_identification import ArmFit, stage_residuals
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.bad_data import CorruptedRegion
-from hydrotele.calibrate.design import ARM_LENGTHS, FOREARM_LENGTHS, Design, DesignSurvey
-from hydrotele.calibrate.linkage import PARAMETER_NAMES, LinkageFit, linkage_parameters
-from hydrotele.calibrate.loop import unit_of
-from hydrotele.calibrate.mukca import HeldOutPrediction, SocketCalibration
+from hydrotele.calibrate.calibration_loop import unit_of
+from hydrotele.calibrate.calibrator_design import ARM_LENGTHS, FOREARM_LENGTHS, Design, DesignSurvey
+from hydrotele.calibrate.linkage_identification import PARAMETER_NAMES, LinkageFit, linkage_parameters
+from hydrotele.calibrate.socket_calibration import HeldOutPrediction, SocketCalibration
 from hydrotele.show.report_html import Section, figure_to_png, open_report_figure, write_sections
 
 _MAX_TIP_ERROR = 0.06  # m, upper limit of the colour scale of the designs

@@ -8,7 +8,7 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.units import plot_axis_unit
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import Channel, parse_channel
+from hydrotele.machine.log_channels import Channel, parse_channel
 
 # {kind of channel: title of its plot}, in the order of the signal path.
 TITLES: Mapping[str, str] = {

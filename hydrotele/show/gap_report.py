@@ -42,11 +42,11 @@ from hydrotele.gap.result import (
     finite,
     in_customary_units,
 )
+from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import default_channel_unit
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
-from hydrotele.show.gap_recording import channel_rms, find_most_improved_channels, windowed_errors
+from hydrotele.show.prediction_errors import channel_rms, find_most_improved_channels, windowed_errors
 from hydrotele.show.report_html import (
     figure_to_png,
     open_report_figure,

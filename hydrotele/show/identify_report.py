@@ -12,8 +12,8 @@ import numpy as np
 
 import hydrotele
 from hydrotele.gap.result import Estimate, amount, in_customary_units
-from hydrotele.identify.hydraulic import HydraulicIdentification
-from hydrotele.identify.identified_machine import ConsistentParameters
+from hydrotele.identify.consistent_parameters import ConsistentParameters
+from hydrotele.identify.hydraulic_identification import HydraulicIdentification
 from hydrotele.identify.result import (
     STATUS_DESCRIPTIONS,
     HeldOutError,

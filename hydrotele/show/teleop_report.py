@@ -14,16 +14,17 @@ import numpy as np
 import hydrotele
 from hydrotele.show import report_html
 from hydrotele.show.report_html import figure_to_png, open_report_figure
-from hydrotele.teleop.analysis import stability_map
-from hydrotele.teleop.findings import ScenarioFindings, TeleopFindings
-from hydrotele.teleop.findings_document import (
+from hydrotele.show.teleop_text import (
     describe_stability,
     format_delay,
     format_gain_margin,
     format_number,
     format_relative_error,
 )
-from hydrotele.teleop.switching import StiffnessAxis, compute_switching_growth_map
+from hydrotele.teleop.case_analysis import TeleopFindings
+from hydrotele.teleop.linear_analysis import stability_map
+from hydrotele.teleop.scenario_analysis import ScenarioFindings
+from hydrotele.teleop.stiffness_switching import StiffnessAxis, compute_switching_growth_map
 from hydrotele.teleop.two_port import Impedance
 
 _INK, _GREY_COLOUR = "#262b33", "#8a94a0"

@@ -11,17 +11,17 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SoilGround
-from hydrotele.show.canvas import Canvas
-from hydrotele.show.pose import (
+from hydrotele.scenario.surrounding_objects import SoilGround
+from hydrotele.show.logged_poses import (
     compile_visual_model,
     compute_joint_positions,
     extract_joint_motion,
     logged_surroundings,
     poses_at_positions,
 )
-from hydrotele.show.recording import compute_machine_camera, compute_tip_path
-from hydrotele.show.soil import soil_history, soil_markers
+from hydrotele.show.offscreen_renderer import Canvas
+from hydrotele.show.rerun_scene import compute_machine_camera, compute_tip_path
+from hydrotele.show.soil_shapes import soil_history, soil_markers
 from hydrotele.simulate.mechanism import GROUND_NAME
 
 _FRAME_RATE = 25.0  # 1/s, so that the video runs in real time

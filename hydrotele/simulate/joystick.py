@@ -26,7 +26,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, matrix_view
 from hydrotele.core.mjcf import load_spec, read_mjcf
 from hydrotele.machine.joystick import Joystick, find_principal_values
-from hydrotele.simulate.layout import call_mj_step, function_address
+from hydrotele.simulate.mujoco_c_api import call_mj_step, function_address
 
 GRAVITY = -9.81
 _COOLED_HEAT = 0.9  # relative heat below which the largest current is allowed again after overheating

@@ -25,22 +25,17 @@ import numpy as np
 from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
 from hydrotele.core.mjcf import read_mjcf, translate_mujoco_errors
-from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
-from hydrotele.hydraulics.parameters import (
+from hydrotele.hydraulics.actuator_layout import (
     SLOT_COUNT,
     Slot,
     actuator_parameters,
     machine_terms_table,
 )
-from hydrotele.kinematics.from_machine import (
-    drive_travel,
-    has_ball_ends,
-    joint_range_at_drive,
-    pin_axis,
-)
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
+from hydrotele.kinematics.drive_linkage import drive_travel, has_ball_ends, joint_range_at_drive, pin_axis
 from hydrotele.machine.drives import Axis, Cylinder, Pin
 from hydrotele.machine.machine import Link, Machine
-from hydrotele.scenario.scenario import SurroundingObject
+from hydrotele.scenario.surrounding_objects import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
 
 NAME_PREFIX = "hydrotele_"

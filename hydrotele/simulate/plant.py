@@ -20,6 +20,13 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.hydraulics.actuator_layout import (
+    Slot,
+    actuator_order,
+    actuator_parameters,
+    extra_state_names,
+    machine_terms_table,
+)
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS_PER_AXIS,
     SCRATCH_SIZE,
@@ -29,16 +36,10 @@ from hydrotele.hydraulics.circuit import (
     make_drive_state,
 )
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_released_air
-from hydrotele.hydraulics.parameters import (
-    Slot,
-    actuator_order,
-    actuator_parameters,
-    extra_state_names,
-    machine_terms_table,
-)
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SurroundingObject
-from hydrotele.simulate.closure import close_loops, holding_forces, independent_dofs, motion_basis
+from hydrotele.scenario.surrounding_objects import SurroundingObject
+from hydrotele.simulate.actuator_callbacks import install_hydraulics
+from hydrotele.simulate.closed_loops import close_loops, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.mechanism import (
     TIP_SITE,
     Mjcf,
@@ -50,8 +51,7 @@ from hydrotele.simulate.mechanism import (
     mjcf_document,
     preload_transmissions,
 )
-from hydrotele.simulate.native import install_hydraulics
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, sum_terms
 
 
@@ -230,7 +230,7 @@ class Plant:
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
         note = (
             "Without hydrotele's native hydraulics the actuators of this file give no force: call"
-            " hydrotele.simulate.native.install_hydraulics() before stepping it."
+            " hydrotele.simulate.actuator_callbacks.install_hydraulics() before stepping it."
         )
         if any(axis.command_delay for axis in self.machine.axes.values()):
             note += " Commands act in it without the delays that hydrotele run and replay apply."

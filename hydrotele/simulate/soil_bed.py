@@ -11,8 +11,8 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SoilGround
-from hydrotele.soil.facts import (
+from hydrotele.scenario.surrounding_objects import SoilGround
+from hydrotele.soil.parameters import (
     CAT215,
     CELL_LENGTH,
     FORCE_R,
@@ -60,11 +60,11 @@ class SoilBed:
 
     Attributes:
         bucket: side view of the bucket.
-        parameters: parameters of soil, bucket and profile; see `soil.facts`.
+        parameters: parameters of soil, bucket and profile; see `soil.parameters`.
         surface: (m,) height of the profile [m].
         loose: (m,) thickness of the loose soil on top [m].
-        state: state of the bucket; see `soil.facts`.
-        result: result of the last step; see `soil.facts`.
+        state: state of the bucket; see `soil.parameters`.
+        result: result of the last step; see `soil.parameters`.
         azimuth: direction of the strip [rad]; NaN before the first step.
     """
 

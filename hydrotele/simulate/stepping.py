@@ -16,10 +16,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.hydraulics.circuit import SCRATCH_SIZE, SLOT_COUNT
-from hydrotele.machine.machine import Machine, SensorError, step_first_order_lag
-from hydrotele.simulate.layout import call_mj_step, function_address
+from hydrotele.machine.machine import Machine
+from hydrotele.machine.sensors import SensorError, step_first_order_lag
+from hydrotele.simulate.mujoco_c_api import call_mj_step, function_address
 from hydrotele.simulate.plant import Plant
-from hydrotele.simulate.record import sensed_channels, split_delay, state_supply_pressure
+from hydrotele.simulate.record import sensed_channels, split_delay
+from hydrotele.simulate.true_values import state_supply_pressure
 
 
 class CommandDelayLine(NamedTuple):

@@ -1,146 +1,20 @@
-"""Objects around a machine in MuJoCo: spring-mounted plates, trees that can be felled, and logs.
+"""Objects around a machine in MuJoCo: plates, logs, soil and trees.
 
-A tree stands on stiff springs, which are removed when it is cut. The saw cuts while it spins: it
-then passes through the wood, which causes a torque on the saw and a feed force on the head. A log
-has contact with the ground only, and so has a tree once it has been held.
-
-A grab takes an object if its jaw is closed and the object lies in the pocket between the jaws. The
-friction of wood on steel is not modelled: a weld constraint connects the object to the grab's body
-in its current pose, so that there is no jerk. `grip_step` is compiled and uses flat arrays, for
-control loops and for native loops over many machines.
+Plates are mounted on springs. Trees stand on stiff springs; a spinning saw cuts them with a cutting
+torque and a feed force. Logs, and trees once they are held, have contact with the ground only.
 """
 
 import math
-from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
-from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import LogOnGround, Plate, SoilGround, StandingTree, SurroundingObject
+from hydrotele.scenario.surrounding_objects import LogOnGround, Plate, SoilGround, StandingTree, SurroundingObject
+from hydrotele.simulate.gripping import RELEASED, TAKEN, grip_parameters, grip_step, timber_log_grip_parameters
 from hydrotele.simulate.soil_bed import BedInSimulation, SoilBed, machine_bucket
-
-(
-    CLOSE_ANGLE,
-    OPEN_ANGLE,
-    POCKET_AXIS,
-    MIN_COSINE,
-    POCKET_CENTRE,
-    POCKET_HALF_SIZE,
-    OBJECT_AXIS,
-    REACH_START,
-    REACH_STOP,
-) = 0, 1, 2, 3, 4, 7, 10, 11, 12
-GRIP_SIZE = 13
-WELD_SIZE = 11  # number of values of a weld in `eq_data`
-RELEASED, UNCHANGED, TAKEN = -1, 0, 1
-
-
-def grip_parameters(
-    close_angle: float, open_angle: float, pocket_axis: int, max_angle: float, pocket_centre: Sequence[float],
-    pocket_half_size: Sequence[float], object_axis: int, reach: tuple[float, float] = (-math.inf, math.inf),
-) -> np.ndarray:  # fmt: skip
-    """Return the conditions under which a grab takes or releases an object, as an array for `grip_step`.
-
-    Args:
-        close_angle: jaw angle above which an object is taken [rad].
-        open_angle: jaw angle below which the object is released [rad], at most `close_angle`.
-        pocket_axis: axis of the grab's frame (0, 1, 2) along which objects lie in the pocket.
-        max_angle: largest angle between this axis and the object's long axis [rad].
-        pocket_centre: (3,) centre of the pocket, a box in the grab's frame [m].
-        pocket_half_size: (3,) half sizes of the pocket [m]; the one along `pocket_axis` is ignored.
-        object_axis: long axis of the object in its own frame (0, 1, 2).
-        reach: range along this axis in which the object can be held, from its origin [m].
-
-    Returns:
-        (GRIP_SIZE,) parameters.
-    """
-    return np.array(
-        [
-            close_angle,
-            open_angle,
-            pocket_axis,
-            math.cos(max_angle),
-            *pocket_centre,
-            *pocket_half_size,
-            object_axis,
-            *reach,
-        ],
-        float,
-    )
-
-
-@compile_without_allocation
-def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle, held, row):
-    """Decide whether a grab takes or releases an object, and set the weld that holds it.
-
-    An object is taken if the jaw is closed and the object's long axis passes through the middle
-    plane of the pocket: inside the box, within the angle limit and within the object's reach.
-
-    Args:
-        grip: (GRIP_SIZE,) result of `grip_parameters`.
-        hand_position: (3,) position of the grab's body, `xpos` [m].
-        hand_quaternion: (4,) its orientation, `xquat`.
-        position: (3,) position of the object's body [m].
-        quaternion: (4,) orientation of the object's body.
-        angle: angle of the jaw [rad].
-        held: whether the object is held.
-        row: (>= WELD_SIZE,) `eq_data` of the weld with the grab as `body1` and the object as `body2`;
-            written when the object is taken.
-
-    Returns:
-        TAKEN, RELEASED or UNCHANGED.
-    """
-    if held:
-        return RELEASED if angle < grip[OPEN_ANGLE] else UNCHANGED
-    if not angle >= grip[CLOSE_ANGLE]:
-        return UNCHANGED
-    w, x, y, z = hand_quaternion[0], hand_quaternion[1], hand_quaternion[2], hand_quaternion[3]
-    a, b, c, d = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    line, own = int(grip[POCKET_AXIS]), int(grip[OBJECT_AXIS])
-    to_x, to_y, to_z = _rotate_vector(
-        w, -x, -y, -z, position[0] - hand_position[0], position[1] - hand_position[1],
-        position[2] - hand_position[2],
-    )  # fmt: skip
-    # the object's quaternion in the grab's frame
-    e = w * a + x * b + y * c + z * d
-    f = w * b - x * a - y * d + z * c
-    g = w * c + x * d - y * a - z * b
-    h = w * d - x * c + y * b - z * a
-    way_x, way_y, way_z = _rotate_vector(
-        e, f, g, h, 1.0 if own == 0 else 0.0, 1.0 if own == 1 else 0.0, 1.0 if own == 2 else 0.0
-    )
-    along = way_x if line == 0 else (way_y if line == 1 else way_z)
-    if abs(along) < max(grip[MIN_COSINE], 1.0e-6):
-        return UNCHANGED
-    level = to_x if line == 0 else (to_y if line == 1 else to_z)
-    far = (grip[POCKET_CENTRE + line] - level) / along
-    if not grip[REACH_START] <= far <= grip[REACH_STOP]:
-        return UNCHANGED
-    for k in range(3):
-        at = to_x + far * way_x if k == 0 else (to_y + far * way_y if k == 1 else to_z + far * way_z)
-        if k != line and not abs(at - grip[POCKET_CENTRE + k]) < grip[POCKET_HALF_SIZE + k]:
-            return UNCHANGED
-    row[0], row[1], row[2] = 0.0, 0.0, 0.0  # the anchor: the object's origin
-    row[3], row[4], row[5] = to_x, to_y, to_z
-    row[6], row[7], row[8], row[9] = e, f, g, h
-    row[10] = 1.0  # m: torque per force of the weld, MuJoCo's default
-    return TAKEN
-
-
-@compile_without_allocation
-def _rotate_vector(w, x, y, z, vx, vy, vz):
-    """Return the vector (vx, vy, vz), rotated by the unit quaternion (w, x, y, z)."""
-    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
-    return (
-        vx + w * tx + y * tz - z * ty,
-        vy + w * ty + z * tx - x * tz,
-        vz + w * tz + x * ty - y * tx,
-    )
-
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
 _CUT_WIDTH = 0.02  # m, width of the saw cut
@@ -152,8 +26,6 @@ _NORMALS = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), 
 _FEED_FORCE_RATIO = 0.3  # feed force per cutting force at the rim of the disc
 _STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head, between its arms
 _MAX_STEM_ANGLE = math.acos(0.9)  # rad: largest angle between stem and head
-_MAX_LOG_ANGLE = math.radians(20.0)  # rad: largest angle between a log and the jaws' axis
-_LOG_END_LENGTH = 0.3  # m: length at a log's end at which it cannot be held
 _LOG_DAMPING = 30.0  # N s/m and N m s/rad: soil damping; a rolling log stops within half a second
 _LOG_PENETRATION = 1.0e-5  # m: static penetration of a log into the soft contact of the ground
 _PREFIXES = ("plate_", "tree_", "log_")
@@ -313,33 +185,6 @@ def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
 def is_surrounding_object(name: str) -> bool:
     """Return whether a body or joint of this name belongs to a plate, tree or log."""
     return name.startswith(_PREFIXES)
-
-
-def timber_log_grip_parameters(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Return the conditions under which a grab takes or releases a timber log, for `grip_step`.
-
-    Args:
-        model: model of the machine. The box site `<grab>_pocket` is the space between the jaws:
-            logs lie along its y axis, with a jaw on either side in z. In x it extends from the head
-            to the tips of the jaws.
-        log: the log.
-
-    Returns:
-        (GRIP_SIZE,) parameters.
-    """
-    site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
-    low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
-    reach = log.length / 2.0 - _LOG_END_LENGTH
-    return grip_parameters(
-        log.closed_angle,
-        log.open_angle,
-        1,
-        _MAX_LOG_ANGLE,
-        0.5 * (low + high),
-        0.5 * (high - low),
-        0,
-        (-reach, reach),
-    )
 
 
 class Surroundings:

@@ -1,15 +1,14 @@
 """Soil that a bucket cuts, carries and drops, in the vertical plane of the arm.
 
-`facts` defines soil and bucket and packs their parameters into one flat array. `terrain` moves soil
+`parameters` defines soil and bucket and packs their parameters into one flat array. `terrain` moves soil
 between the cells of the profile. `step` contains the closed-form soil mechanics, the volume that a
 tilted bucket holds, the time step of soil and bucket, and the wrench on a MuJoCo body. Every
 environment has its own profile, bucket state and result; the parameters can be common to all.
 Nothing is allocated during a step:
 
 >>> import numpy as np
->>> from hydrotele.soil.facts import SOILS
->>> from hydrotele.soil.facts import RESULT_SIZE, FORCE_R, make_bucket_state, make_level_profile, pack_soil_parameters
->>> from hydrotele.soil.facts import CAT215
+>>> from hydrotele.soil.parameters import CAT215, FORCE_R, RESULT_SIZE, SOILS
+>>> from hydrotele.soil.parameters import make_bucket_state, make_level_profile, pack_soil_parameters
 >>> from hydrotele.soil.step import EdgeMotion, step_soil
 >>> numbers = pack_soil_parameters(SOILS["firm"], CAT215, start=3.0, cell=0.05)
 >>> (surface, loose), state, out = make_level_profile(140), make_bucket_state(), np.zeros(RESULT_SIZE)

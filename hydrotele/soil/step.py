@@ -21,7 +21,7 @@ import math
 from typing import NamedTuple
 
 from hydrotele.core.compiled import compile_without_allocation
-from hydrotele.soil.facts import (
+from hydrotele.soil.parameters import (
     ADHESION,
     BUCKET_SIZE,
     CARRIED_VOLUME,

@@ -9,7 +9,7 @@ its ends, so that mass is conserved.
 import math
 
 from hydrotele.core.compiled import compile_without_allocation
-from hydrotele.soil.facts import CELL_LENGTH, CUT_SLOPE, PROFILE_START, REPOSE, SWELL, WIDTH
+from hydrotele.soil.parameters import CELL_LENGTH, CUT_SLOPE, PROFILE_START, REPOSE, SWELL, WIDTH
 
 MIN_SLIDING_HEIGHT = 1e-4  # m, height difference above the stable one at which soil does not slide
 

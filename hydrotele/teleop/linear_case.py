@@ -41,17 +41,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import COORDINATES, arm_axes, pose_to_joints
+from hydrotele.control.arm_kinematics import COORDINATES, arm_axes, pose_to_joints
 from hydrotele.control.state_filter import butterworth_response
 from hydrotele.control.tip_balance import ArmBalance, create_arm_balance
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_model import X, place_mechanism
 from hydrotele.hydraulics.circuit import SLOT_COUNT, ActuatorKind, Slot
-from hydrotele.kinematics.task import task_jacobian
+from hydrotele.kinematics.task_space import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.machine.machine import Machine, get_sensor_set
-from hydrotele.multibody.reduced_mechanism import compute_mass_and_bias
-from hydrotele.scenario.scenario import Plate, Scenario, Servo
+from hydrotele.multibody.reduced_dynamics import compute_mass_and_bias
+from hydrotele.scenario.scenario import Scenario, Servo
+from hydrotele.scenario.surrounding_objects import Plate
 from hydrotele.scenario.teleoperation import RegulateForce, TeleopPilot, TrackForce
 from hydrotele.teleop.axis_table import (
     COORDINATE,
@@ -68,11 +69,12 @@ from hydrotele.teleop.axis_table import (
     NOMINAL_STIFFNESS,
     REFLECTION_RATIO,
 )
+from hydrotele.teleop.hand_impedance import attach_operator_hand
 from hydrotele.teleop.master import MasterParameters, build_master
-from hydrotele.teleop.operator_model import DECISION_RATE, REFLEX_DELAY
-from hydrotele.teleop.operator_parameters import attach_operator_hand
+from hydrotele.teleop.neuromuscular_dynamics import REFLEX_DELAY
+from hydrotele.teleop.operator_model import DECISION_RATE
 from hydrotele.teleop.slave import LEAD_AVERAGING_TIME, SMOOTHING_BANDWIDTH
-from hydrotele.teleop.switching import StiffnessAxis
+from hydrotele.teleop.stiffness_switching import StiffnessAxis
 from hydrotele.teleop.two_port import Impedance, TwoPort
 
 
@@ -261,7 +263,7 @@ class LinearCase:
     """Linear loop of one axis with hand, joystick, machine and task.
 
     It provides `task`, `hand`, `with_delay` and `make_port`, so that the functions of
-    `teleop.analysis` can analyse it.
+    `teleop.linear_analysis` can analyse it.
 
     Attributes:
         pilot: teleoperation settings of the scenario.

@@ -1,18 +1,11 @@
-"""Simulated operator: perception, decisions and neuromuscular dynamics in one run.
+"""Simulated operator: observations, estimates and decisions of one run.
 
 The operator does not know the contact force or the machine's gains. The operator feels the handle's
 motion, sees the tip and its contact, and in `track` also a display of the reference force. The
 effect of a push is learnt from earlier pushes. The joystick's own springs and the scale of its
 reflection are known to the operator. Decisions are made at 50 Hz; visual control follows
-`teleop.manual_control`, and the parameters are in `teleop.operator_parameters`.
-
-The neuromuscular dynamics convert a reference displacement to forces on the handle.
-
-A force or a displacement is felt with an error in proportion to its size (Weber's law). Combining
-both to a stiffness adds another error. People resolve compliance by 22 % when they cannot use work
-or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception & Psychophysics 57). They
-resolve force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb movement by 8 % (Jones,
-Hunter and Irwin 1992, ibid. 52). The errors stay constant during one exploration of the handle.
+`teleop.manual_control`, and the parameters are in `teleop.operator_parameters`. The errors of
+feeling are in `teleop.perception`, the forces of the muscles in `teleop.neuromuscular_dynamics`.
 """
 
 import math
@@ -23,8 +16,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import COORDINATES
+from hydrotele.control.arm_kinematics import COORDINATES
 from hydrotele.core.compiled import compiled
+from hydrotele.core.contiguous_state import copy_to_contiguous_state
 from hydrotele.core.errors import InputError
 from hydrotele.core.units import si_unit_and_factor
 from hydrotele.logs.table import read_table
@@ -50,8 +44,6 @@ from hydrotele.teleop.axis_table import (
     REFLECTION_RATIO,
     SIGN,
     STIFFNESS_PER_FORCE,
-    copy_to_contiguous_state,
-    split_array,
 )
 from hydrotele.teleop.manual_control import (
     ESTIMATED_GAIN,
@@ -64,188 +56,11 @@ from hydrotele.teleop.manual_control import (
     make_visual_loop,
 )
 from hydrotele.teleop.master import MasterParameters
+from hydrotele.teleop.neuromuscular_dynamics import REFLEX_DELAY, NeuromuscularState
 from hydrotele.teleop.operator_parameters import Operator, make_scenario_operator
-
-
-class PerceptionErrors(NamedTuple):
-    """Random errors of perceived forces, displacements and stiffnesses in n decisions.
-
-    Attributes:
-        force: (n,) factor on the perceived force.
-        displacement: (n,) factor on the perceived displacement.
-        stiffness: (n,) factor due to the combination of both.
-        stiffness_deviation: relative standard deviation of a perceived stiffness, known to the operator [1].
-    """
-
-    force: np.ndarray
-    displacement: np.ndarray
-    stiffness: np.ndarray
-    stiffness_deviation: float
-
-
-def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: int, step: float) -> PerceptionErrors:
-    """Draw random perception errors for all decisions of a run.
-
-    They are log-normal and constant during one exploration of the handle.
-
-    Args:
-        operator: operator with Weber fractions (relative standard deviations of perceived quantities);
-            an exploration lasts `correction_interval`.
-        rng: random generator of the errors.
-        count: number of decisions.
-        step: time between two decisions [s].
-
-    Returns:
-        The errors.
-    """
-    exploration = (step * np.arange(count) / operator.correction_interval).astype(int)
-    drawn = rng.standard_normal((exploration[-1] + 1, 3))[exploration]
-    weber = np.array([operator.force_weber, operator.position_weber, operator.integration_weber])
-    errors = np.exp(weber * drawn)
-    return PerceptionErrors(*errors.T, stiffness_deviation=math.hypot(*weber))
-
-
-def perceive_stiffness(
-    force: float, displacement: float, errors: PerceptionErrors, decision: int
-) -> float:  # fmt: skip
-    """Return the stiffness of a spring as a hand perceives it: force over displacement, with errors.
-
-    Args:
-        force: force on the hand [N].
-        displacement: displacement of the hand [m], not 0.
-        errors: perception errors.
-        decision: number of the decision.
-
-    Returns:
-        The perceived stiffness [N/m].
-    """
-    felt = force * errors.force[decision] / (displacement * errors.displacement[decision])
-    return float(felt * errors.stiffness[decision])
-
-
-_NOTCH_FORCE_FACTOR = 1.15  # factor on the force at a notch's edge, to overcome it
-_MAX_POSITION_GAP, _MAX_ROTATION_GAP = (
-    4e-4,
-    4e-3,
-)  # m, rad: limit on the position error that is integrated
-
-
-class NeuromuscularState(NamedTuple):
-    """Parameters and state of the neuromuscular dynamics of arm and hand, for the six handle axes.
-
-    Attributes:
-        reference: (6,) reference displacement of the handle [m], [rad].
-        spring: (6,) expected stiffness of the joystick [N/m], [N m/rad].
-        detent: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside [N/m], < 0
-            without a detent.
-        correction: (6,) learnt additional force [N], [N m].
-        force: (6,) force on the handle [N], [N m].
-        arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
-        cross: (1,) coupling stiffness of the arm between x and y [N/m].
-        max_force: (6,) maximum force [N], [N m].
-        weight: (6,) weight of the hand, which the muscles carry [N], [N m].
-        gain: (1,) integral gain of the correction [1/s].
-        rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
-        rate: (6,) its rate.
-        lag: (6,) discrete neuromuscular lag for one control period, from `discretise_neuromuscular_lag`.
-    """
-
-    reference: np.ndarray
-    spring: np.ndarray
-    detent: np.ndarray
-    correction: np.ndarray
-    force: np.ndarray
-    arm: np.ndarray
-    cross: np.ndarray
-    max_force: np.ndarray
-    weight: np.ndarray
-    gain: np.ndarray
-    rest: np.ndarray
-    rate: np.ndarray
-    lag: np.ndarray
-
-
-@compiled
-def unpack_neuromuscular_state(flat):
-    """Return the fields of NeuromuscularState as views of a flat array.
-
-    Args:
-        flat: (80,) array, as from `flat_view` of a NeuromuscularState.
-
-    Returns:
-        NeuromuscularState.
-
-    Source: order and shapes of NeuromuscularState.
-    """
-    wanted, rest = split_array(flat, 6)
-    spring, rest = split_array(rest, 6)
-    notch, rest = split_array(rest, 18)
-    correction, rest = split_array(rest, 6)
-    force, rest = split_array(rest, 6)
-    arm, rest = split_array(rest, 6)
-    cross, rest = split_array(rest, 1)
-    most, rest = split_array(rest, 6)
-    weight, rest = split_array(rest, 6)
-    gain, rest = split_array(rest, 1)
-    place, rest = split_array(rest, 6)
-    rate, lag = split_array(rest, 6)
-    return NeuromuscularState(
-        wanted, spring, notch.reshape(3, 6), correction, force, arm, cross, most, weight, gain,
-        place, rate, lag,
-    )  # fmt: skip
-
-
-@compiled
-def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
-    """Compute the muscle forces on the handle in one control period from its reference displacement.
-
-    Args:
-        muscles: NeuromuscularState. The result is `force`, the force on the handle; `rest` and `rate` (rest
-            position of the arm and its rate) and `correction` (learnt force) are updated.
-        history: (d + 1, 6) ring buffer of handle displacements for a reflex delay of d periods,
-            written [m], [rad].
-        tremor: (n, 6) tremor forces [N], [N m].
-        handle: (6,) present displacement [m], [rad].
-        tick: number of the period, scalar.
-        period: control period, scalar [s].
-
-    Returns:
-        Nothing.
-
-    Source: equilibrium-point control with a delayed integral; Feldman 1986. The rest position
-        follows the reference through the neuromuscular lag; McRuer and Jex 1967.
-    """
-    rows, lag = len(history), muscles.lag
-    noise = tick % len(tremor)
-    for i in range(6):
-        place, rate = muscles.rest[i], muscles.rate[i]
-        muscles.rest[i] = lag[0] * place + lag[1] * rate + lag[2] * muscles.reference[i]
-        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.reference[i]
-    for i in range(6):
-        history[tick % rows, i] = handle[i]
-        late = history[(tick + 1) % rows, i]
-        spring, most, wanted = muscles.spring[i], muscles.max_force[i], muscles.rest[i]
-        firm = muscles.arm[i] + spring
-        known = firm * wanted
-        beyond = abs(wanted) - muscles.detent[0, i]
-        if muscles.detent[2, i] >= 0.0 and beyond > 0.0:
-            firm = muscles.arm[i] + muscles.detent[2, i]
-            back = spring * muscles.detent[0, i] - muscles.detent[1, i] + muscles.detent[2, i] * beyond
-            if (late if wanted > 0.0 else -late) < muscles.detent[0, i]:
-                back = _NOTCH_FORCE_FACTOR * spring * muscles.detent[0, i]  # force to overcome the notch's edge
-            known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
-        if i < 2:
-            known += muscles.cross[0] * muscles.rest[1 - i]
-        fine = _MAX_POSITION_GAP if i < 3 else _MAX_ROTATION_GAP
-        gap = min(fine, max(-fine, wanted - late))
-        more = muscles.gain[0] * period * firm * gap
-        muscles.correction[i] = min(most, max(-most, muscles.correction[i] + more))
-        force = known + muscles.correction[i] + tremor[noise, i]
-        muscles.force[i] = min(most, max(-most, force)) + muscles.weight[i]
-
+from hydrotele.teleop.perception import draw_perception_errors, perceive_stiffness
 
 DECISION_RATE = 50.0  # Hz
-REFLEX_DELAY = 0.05  # s, delay from hand position to muscle force: stretch reflex and cortex
 _REST_RATIO = 0.8  # rest position of a hand that only feels, as a fraction of the dead band
 _FORCE_TOLERANCE_RATIO = 0.05  # force error that is not corrected, relative to the target
 _MIN_TOLERANCE_RATIO = 0.2  # lower limit of that error, relative to its value at the largest target

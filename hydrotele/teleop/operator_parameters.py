@@ -1,4 +1,4 @@
-"""Parameters of the simulated human operator: files, random operators, arm and hand impedance.
+"""Parameters of the simulated human operator: files and random operators.
 
 `hydrotele/teleop/operator.yaml` is the default file. A scenario can name another file
 (`perception: {file: my_operator.yaml}`, as `hydrotele identify-operator` writes it), which needs
@@ -8,7 +8,6 @@ only the parameters that differ. It can also sample an operator from the paramet
 
 import dataclasses
 import functools
-import math
 from pathlib import Path
 from typing import Literal
 
@@ -24,10 +23,9 @@ from hydrotele.core.datafile import (
     read_yaml,
     validate_data,
 )
-from hydrotele.core.datafile import suggest_valid_name as suggest_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
-from hydrotele.machine.joystick import HandImpedance, Joystick, SymmetricMatrix
+from hydrotele.machine.joystick import HandImpedance, SymmetricMatrix
 from hydrotele.scenario.teleoperation import RENAMED_OPERATOR_PARAMETERS, OperatorSettings
 
 DEFAULT_OPERATOR_FILE = Path(__file__).resolve().with_name("operator.yaml")
@@ -236,136 +234,11 @@ def make_scenario_operator(perception: OperatorSettings, folder: str = "") -> Op
     """
     known = {name: getattr(perception, name) for name in _PARAMETER_NAMES if hasattr(perception, name)}
     known = {name: value for name, value in known.items() if value is not None}
-    return make_operator(_load_perception_file(perception, folder), perception.sample, **known)
+    return make_operator(load_perception_file(perception, folder), perception.sample, **known)
 
 
-def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folder: str = "") -> Joystick:
-    """Return a copy of the joystick with the hand impedance of the scenario's operator.
-
-    Grip, posture and co-contraction of the settings change the impedance; without them the hand of the
-    joystick file is used.
-
-    Args:
-        joystick: the joystick.
-        perception: operator settings of the scenario (key `perception`).
-        folder: folder of the scenario, to which its file is relative.
-
-    Returns:
-        The joystick with the operator's hand.
-
-    Raises:
-        InputError: the grip or posture is not known, the posture is out of the arm's reach, or the
-            file is invalid.
-
-    Source: `arm_impedance` for the posture; Hogan 1984 for co-contraction.
-    """
-    file, him = _load_perception_file(perception, folder), make_scenario_operator(perception, folder)
-    hand = joystick.hand
-    if perception.grip:
-        if perception.grip not in file.grips:
-            message = f"{perception.grip!r}; {suggest_name(perception.grip, file.grips)}"
-            raise InputError("pilot.perception.grip", message)
-        hand = file.grips[perception.grip]
-    factor = 1.0 + (him.cocontraction_stiffness_factor - 1.0) * min(1.0, him.cocontraction)
-    if perception.posture:
-        if perception.posture not in file.postures:
-            message = f"{perception.posture!r}; {suggest_name(perception.posture, file.postures)}"
-            raise InputError("pilot.perception.posture", message)
-        hand = apply_posture(hand, file, perception.posture)
-    return joystick.model_copy(update={"hand": scale_hand_stiffness(hand, factor)})
-
-
-def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> HandImpedance:
-    """Return a copy of a hand with the horizontal mass and stiffness ellipses of an arm's posture.
-
-    Args:
-        hand: hand with the grip's parameters.
-        file: file with the arm and the posture.
-        posture: name of the posture.
-
-    Returns:
-        The hand; its vertical and rotational impedance stays that of the grip.
-
-    Raises:
-        InputError: the posture is out of the arm's reach.
-    """
-    arm = file.arm
-    assert arm  # the default file has one
-    shapes = []
-    for matrix, usual in zip(
-        arm_impedance(arm, file.postures[posture]),
-        arm_impedance(arm, file.postures[arm.reference_posture]), strict=True,
-    ):  # fmt: skip
-        shape = matrix / math.sqrt(np.linalg.det(usual))
-        shapes.append((float(shape[0, 0]), float(shape[0, 1]), float(shape[1, 1])))
-    return hand.model_copy(update={"mass_shape": shapes[0], "stiffness_shape": shapes[1]})
-
-
-def arm_impedance(arm: ArmParameters, hand_position: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the mass and stiffness of an arm at its hand, in the horizontal plane.
-
-    A matrix A of the joints becomes `J^-T A J^-1` at the hand, with the Jacobian J of the hand's
-    position by the joint angles.
-
-    Args:
-        arm: two links, with the elbow to the right of the line from shoulder to hand.
-        hand_position: hand position, ahead and to the left of the shoulder [m].
-
-    Returns:
-        (2, 2) mass [kg] and stiffness [N/m], ahead and to the left.
-
-    Raises:
-        InputError: the position is out of reach.
-
-    Source: Hogan 1985 (impedance in other coordinates); Mussa-Ivaldi, Hogan and Bizzi 1985.
-
-    >>> file = load_operator_file()
-    >>> assert file.arm
-    >>> arm_impedance(file.arm, (0.4, 0.0))[1].round().tolist()
-    [[499.0, 22.0], [22.0, 184.0]]
-    """
-    (upper, fore), (x, y) = arm.length, hand_position
-    bend = (x * x + y * y - upper**2 - fore**2) / (2.0 * upper * fore)
-    if not abs(bend) < 1.0:
-        message = f"a hand at {x:g}, {y:g} m is out of reach of links of {upper:g} and {fore:g} m"
-        raise InputError("postures", message)
-    elbow = math.acos(bend)
-    far = fore * math.sin(elbow)
-    shoulder = math.atan2(y, x) - math.atan2(far, upper + fore * bend)
-    along, across = fore * math.cos(shoulder + elbow), fore * math.sin(shoulder + elbow)
-    jacobian = np.array([[-y, -across], [x, along]])
-    (m1, m2), (i1, i2) = arm.mass, arm.inertia
-    second = i2 + m2 * (0.5 * fore) ** 2
-    both = second + 0.5 * m2 * upper * fore * bend
-    first = i1 + m1 * (0.5 * upper) ** 2 + m2 * upper**2 + 2.0 * both - second
-    mass = np.array([[first, both], [both, second]])
-    k_shoulder, k_both, k_elbow = arm.joint_stiffness
-    stiffness = np.array([[k_shoulder, k_both], [k_both, k_elbow]])
-    inverse = np.linalg.inv(jacobian)
-    return inverse.T @ mass @ inverse, inverse.T @ stiffness @ inverse
-
-
-def scale_hand_stiffness(hand: HandImpedance, factor: float) -> HandImpedance:
-    """Return a copy of a hand with `factor` times the stiffness and the same damping ratio.
-
-    Antagonist muscles that contract together add stiffness and damping but no force (Hogan 1984).
-
-    Args:
-        hand: mass [kg], damping [N s/m] and stiffness [N/m].
-        factor: factor on the stiffness.
-
-    Returns:
-        The stiffer hand.
-    """
-    root = math.sqrt(factor)
-    return hand.model_copy(update={
-        "stiffness": factor * hand.stiffness, "damping": root * hand.damping,
-        "rotation_stiffness": factor * hand.rotation_stiffness,
-        "rotation_damping": root * hand.rotation_damping,
-    })  # fmt: skip
-
-
-def _load_perception_file(perception: OperatorSettings, folder: str) -> OperatorFile:
+def load_perception_file(perception: OperatorSettings, folder: str) -> OperatorFile:
+    """Load the operator file that a scenario names, or the default file."""
     if perception.file is None:
         return load_operator_file()
     return load_operator_file(resolve_path(Path(folder, perception.file)))

@@ -17,18 +17,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
+from hydrotele.core.contiguous_state import copy_to_contiguous_state
 from hydrotele.machine.joystick import HandImpedance
-from hydrotele.teleop.axis_table import copy_to_contiguous_state
 from hydrotele.teleop.manual_control import discretise_neuromuscular_lag
-from hydrotele.teleop.operator_model import (
-    REFLEX_DELAY,
-    NeuromuscularState,
-    PerceptionErrors,
-    compute_muscle_forces,
-    draw_perception_errors,
-    perceive_stiffness,
-)
+from hydrotele.teleop.neuromuscular_dynamics import REFLEX_DELAY, NeuromuscularState, compute_muscle_forces
 from hydrotele.teleop.operator_parameters import Operator
+from hydrotele.teleop.perception import PerceptionErrors, draw_perception_errors, perceive_stiffness
 
 _LEVELS = {
     "stiffness": (-0.6, -0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45, 0.6),

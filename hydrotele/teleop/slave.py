@@ -14,14 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import (
-    COORDINATES,
-    arm_specification,
-    step_references_by_rate,
-    step_references_to_pose,
-)
+from hydrotele.control.arm_kinematics import COORDINATES, arm_specification
+from hydrotele.control.resolved_motion import step_references_by_rate, step_references_to_pose
 from hydrotele.core.compiled import compiled
-from hydrotele.kinematics.task import compute_tip_pose
+from hydrotele.core.contiguous_state import copy_to_contiguous_state, make_contiguous_state, split_array
+from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.teleoperation import CoordinateMapping, TeleopPilot
 from hydrotele.teleop.axis_table import (
@@ -36,9 +33,6 @@ from hydrotele.teleop.axis_table import (
     MAX_REFLECTED_FORCE,
     REFLECTION_RATIO,
     SIGN,
-    copy_to_contiguous_state,
-    make_contiguous_state,
-    split_array,
 )
 from hydrotele.teleop.master import (
     CHANNEL_ENERGY,
@@ -57,7 +51,7 @@ from hydrotele.teleop.master import (
     WAVE_VARIABLES,
     MasterParameters,
 )
-from hydrotele.teleop.passive_line import ENERGY_IN, step_passivity_slave, step_wave_slave
+from hydrotele.teleop.passive_channel import ENERGY_IN, step_passivity_slave, step_wave_slave
 
 HELD_AT_EDGE, NO_PACKETS, VALVES_CLOSED, PACKET_AGE = range(4)  # indices into `SlaveState.flags`
 USES_JACOBIAN = 4  # index into `SlaveParameters.kind`
@@ -74,7 +68,7 @@ class SlaveParameters(NamedTuple):
     """Parameters of the slave side, for an arm with k joints and k task coordinates.
 
     Attributes:
-        arm: (9,) geometry of the arm, from `kinematics.task.arm_parameters`.
+        arm: (9,) geometry of the arm, from `kinematics.task_space.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
         table: (k, 12) parameters of every coordinate: joystick axis (-1 without), sign, gain, dead
@@ -246,7 +240,7 @@ def measure_tip(parameters, joint, fresh, elapsed, s):
     Returns:
         Nothing.
 
-    Source: `kinematics.task`; first-order filter.
+    Source: `kinematics.task_space`; first-order filter.
     """
     if not fresh:
         return

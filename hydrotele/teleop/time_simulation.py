@@ -1,4 +1,4 @@
-"""Time simulation of a teleoperator that checks the predictions of the linear analysis.
+"""Time simulation of a teleoperator: two masses with their channels as differential equations with delay.
 
 The simulation checks the linear predictions. It integrates two masses, master and slave with
 their channels, as differential equations with delay. A case is written as coefficients on signals.
@@ -14,22 +14,14 @@ linear stability test that it checks.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import (
-    TeleoperatorAxis,
-    stability_map,
-)
-from hydrotele.teleop.two_port import (
-    Impedance,
-    count_unstable_poles_held,
-    transmitted_impedance,
-)
+from hydrotele.teleop.case_file import TeleoperatorAxis
+from hydrotele.teleop.two_port import Impedance
 
 INT, X, V, A, IMPULSE, FORCE, Y, W, W1, W2 = range(10)
 _KNOWN_SIGNALS = np.array([INT, X, V, IMPULSE, Y, W])
@@ -358,103 +350,3 @@ def _advance_motion_signals(q, before, step, first):
     q[X] += 0.5 * step * (v + q[V])
     q[Y] += 0.5 * step * (w + q[W])
     q[INT] += 0.5 * step * (x + q[X])
-
-
-SWEEP_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency range of hand motion
-
-
-@dataclass(frozen=True)
-class SineSweep:
-    """Impedance that is transmitted to the operator, from the formula and from simulated sines.
-
-    Attributes:
-        structure: name of the structure.
-        delay_forward: delay from the master to the slave [s].
-        delay_back: delay from the slave to the master [s].
-        frequencies: (n,) [rad/s].
-        expected: (n,) predicted by the formula [N s/m].
-        measured: (n,) measured in simulation [N s/m]; empty if the slave is unstable while the
-            master is held, so that no measurement is possible.
-    """
-
-    structure: str
-    delay_forward: float
-    delay_back: float
-    frequencies: np.ndarray
-    expected: np.ndarray
-    measured: np.ndarray
-
-    @property
-    def max_relative_error(self) -> float | None:
-        """Largest difference of measured and predicted impedance, relative to the latter [1].
-
-        None if no measurement is possible.
-        """
-        if not len(self.measured):
-            return None
-        return float(np.max(np.abs(self.measured / self.expected - 1.0)))
-
-
-@dataclass(frozen=True)
-class StabilityComparison:
-    """Predicted and simulated stability on a grid of delays and factors on the return channels.
-
-    Attributes:
-        structure: name of the structure.
-        delays: (n,) delays in each direction [s].
-        factors: (m,) factors on the return channels [1].
-        predicted: (m, n) true where predicted stable.
-        simulated: (m, n) true where stable in simulation.
-    """
-
-    structure: str
-    delays: np.ndarray
-    factors: np.ndarray
-    predicted: np.ndarray
-    simulated: np.ndarray
-
-    @property
-    def agreement_fraction(self) -> float:
-        """Fraction of the grid cells in which linear prediction and simulation agree [1]."""
-        return float(np.mean(self.predicted == self.simulated))
-
-
-def run_sine_sweep(case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = SWEEP_FREQUENCIES) -> SineSweep:
-    """Compute the impedance transmitted to the operator, and measure it in simulation with sines.
-
-    Args:
-        case: teleoperator with its task.
-        structure: name of the structure.
-        frequencies: (n,) [rad/s].
-
-    Returns:
-        Predicted and measured impedances.
-    """
-    port = case.make_port(structure)
-    expected = transmitted_impedance(port, 1j * frequencies, case.task)
-    measured = []
-    if count_unstable_poles_held(port, case.task) == 0:
-        measured = [measure_sine_impedance(case, structure, float(w)) for w in frequencies]
-    return SineSweep(structure, case.delay_forward, case.delay_back, frequencies, expected, np.array(measured))
-
-
-def compare_stability(
-    case: TeleoperatorAxis, structure: str, delays: np.ndarray, factors: np.ndarray
-) -> StabilityComparison:
-    """Predict stability linearly and by simulation, for all pairs of a delay and a return gain.
-
-    Args:
-        case: teleoperator with hand and task.
-        structure: name of the structure.
-        delays: (n,) delays in each direction [s].
-        factors: (m,) factors on the return channels [1].
-
-    Returns:
-        Predicted and simulated stability.
-    """
-    seen = [
-        [not is_growing(simulate_impulse_response(case.with_delay(float(t)), structure, float(k))) for t in delays]
-        for k in factors
-    ]
-    predicted = stability_map(case, structure, delays, factors)
-    return StabilityComparison(structure, delays, factors, predicted, np.array(seen))

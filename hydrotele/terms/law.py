@@ -1,4 +1,4 @@
-"""Laws and terms: functions of a drive's state that add to its force, flow or command.
+"""Laws: functions of a drive's state that add to its force, flow or command.
 
     @law
     def quadratic_drag(s, coefficient):
@@ -11,9 +11,6 @@ and other compiled functions only. A parameter is a number by default. An argume
 `Variable` is the name of a state variable in the file and its index in the call. An argument
 annotated as `Numbers` is a list in the file and an array in the call. Default values of arguments
 apply to omitted parameters.
-
-A `Term` of a machine specifies which law adds to which balance of which drive. A balance is one of
-the sums in `BALANCES`: force, chamber flows, command or supply flow.
 
 The law `formula` evaluates sums of products of basic functions, given in machine files:
 
@@ -30,87 +27,16 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
-from pydantic import model_validator
 
 from hydrotele.core.datafile import (
     MAX_MAGNITUDE,
-    Name,
-    NonNegativeFloat,
-    PositiveFloat,
-    StrictModel,
     suggest_valid_name,
 )
 from hydrotele.core.errors import InputError
-
-
-class DriveState(NamedTuple):
-    """Physical variables of one drive at an instant, all in SI units.
-
-    Attributes:
-        time: time since the start of the run [s].
-        position: piston displacement or motor angle [m] or [rad].
-        velocity: velocity of the piston or motor [m/s] or [rad/s].
-        spool: spool position [1]; this and the next three variables are 0 without a valve. For a
-            drive with its own pump it is the pump speed [rad/s], `pump_speed` in files.
-        spool_rate: rate of the spool [1/s]. For a drive with its own pump it is the pressure in its
-            load cylinder [Pa], `pressure_load` in files.
-        pressure_head: pressure of the head-side chamber, or port A of a motor [Pa].
-        pressure_rod: pressure of the rod-side chamber, or port B [Pa].
-        pressure_supply: pressure at the inlet of the valves [Pa].
-        command: command to the valve or drive after its delay, without terms [1], [V].
-        force: force of the oil on the piston, or of a force drive, before friction [N] or [N m].
-        play_output: output of the term's backlash operator (`play`) [unit of its variable]; 0 without.
-        play_difference: difference between the variable and this output, at most half the backlash
-            width.
-    """
-
-    time: float
-    position: float
-    velocity: float
-    spool: float
-    spool_rate: float
-    pressure_head: float
-    pressure_rod: float
-    pressure_supply: float
-    command: float
-    force: float
-    play_output: float
-    play_difference: float
-
-
-class Drives(NamedTuple):
-    """States of all drives at an instant, for laws that use variables of another drive.
-
-    Attributes:
-        count: number of hydraulic drives, which come first.
-        act: (>= 4 count,) spool [1], spool rate [1/s], head- and rod-side pressure [Pa] of each.
-        position: (nu,) piston displacements or motor angles [m] or [rad].
-        velocity: (nu,) their rates [m/s] or [rad/s].
-        command: (nu,) commands after their delays [1] or [V].
-    """
-
-    count: int
-    act: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    command: np.ndarray
-
-
-NO_DRIVES = Drives(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
-"""For laws that use no variables of other drives."""
-
-VARIABLES = {name: index for index, name in enumerate(DriveState._fields)}
-"""Name of a state variable in files -> its index in `DriveState`."""
-VARIABLES |= {"pump_speed": VARIABLES["spool"], "pressure_load": VARIABLES["spool_rate"]}
-_RENAMED_VARIABLES = {"played": "play_output", "ahead": "play_difference"}
-_RENAMED_LAWS = {"table2": "bilinear_table"}
-
-
-def _suggest_variable(name: str) -> str:
-    return suggest_valid_name(name, VARIABLES, _RENAMED_VARIABLES)
+from hydrotele.terms.drive_state import VARIABLES, DriveState, suggest_valid_variable
 
 
 class Variable(int):
@@ -124,7 +50,6 @@ class Numbers(np.ndarray):
     """Annotation of a law's argument that is a list of numbers, passed as a flat array."""
 
 
-Value = float | str | tuple[float, ...] | tuple[tuple[float, ...], ...]
 Parameters = Mapping[str, Any]
 _KINDS = (float, Variable, Numbers)
 
@@ -196,7 +121,7 @@ def _encode_value(law: str, name: str, kind: type, value: Any) -> list[float]:
     where = f"law {law}: parameter {name}"
     if kind is Variable:
         if value not in VARIABLES:
-            raise ValueError(f"{where}: {value!r} is not a variable; {_suggest_variable(value)}")
+            raise ValueError(f"{where}: {value!r} is not a variable; {suggest_valid_variable(value)}")
         return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
@@ -382,7 +307,7 @@ def _parse_variable(text: str, node: ast.expr) -> int:
     """Return the index in `DriveState` of the variable that a syntax node names."""
     name = node.id if isinstance(node, ast.Name) else ast.get_source_segment(text, node) or text
     if name not in VARIABLES:
-        raise _make_formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
+        raise _make_formula_error(text, f"{name!r} is not a variable; {suggest_valid_variable(name)}")
     return VARIABLES[name]
 
 
@@ -670,112 +595,3 @@ def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: fl
     """
     viscosity = 1.0 + (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
     return leakage * (1.0 / viscosity - 1.0) * (s.pressure_head - s.pressure_rod)
-
-
-BALANCES = ("force", "flow_head", "flow_rod", "command", "flow_supply")
-Balance = Literal["force", "flow_head", "flow_rod", "command", "flow_supply"]
-DRIVE_VARIABLES = (
-    "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
-    "pressure_rod", "command", "force",
-)  # fmt: skip
-"""Variables that a law can take from another drive."""
-
-
-class Play(StrictModel):
-    """Backlash operator (play) between a state variable and the law of a term.
-
-    The output stays constant while the variable moves within `half_width` [unit of the variable] of
-    it, and follows the variable beyond. The law reads the output as `play_output`, and the variable
-    minus the output as `play_difference`. The initial output is the value nearest to 0 that the
-    variable permits.
-    """
-
-    variable: str
-    half_width: PositiveFloat
-
-
-class Switch(StrictModel):
-    """Relay with hysteresis that switches a law on and off by a state variable.
-
-    The law becomes active when the variable passes `on`, and inactive when it returns past `off`
-    (both in the unit of the variable). Each transition is a ramp over a tenth of the interval between
-    both. With `on` below `off` the law is active at low values of the variable.
-    """
-
-    variable: str
-    on: float
-    off: float
-
-    @model_validator(mode="after")
-    def _check(self):
-        if self.on == self.off:
-            raise ValueError(f"on and off are both {self.on:g}; they must be different")
-        return self
-
-
-class Term(StrictModel):
-    """A law with parameters that adds a force, flow or command to one drive of a machine.
-
-    - `axis`: name of the drive's axis.
-    - `law`, `parameters`: name of the law, and the values of its arguments.
-    - `name`: origin of the term, such as the name of an effect.
-    - `balance`: `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
-      [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (flow of the shared pump,
-      which follows with a time constant of 20 ms [m^3/s]).
-    - `variables_from`: variables taken from another drive; with `{velocity: swing}` the variable
-      `velocity` of the law is that of the swing.
-    - `domain`: variable -> range to which it is clipped.
-    - `window`: start and stop time between which the term is active [s], each with a ramp of 0.1 s.
-    - `play`, `switch`: hysteresis of the term, in a machine with hydraulic axes.
-    - `uncertainty`: standard deviation of the value of the law.
-    - `source`: file or plug-in that defines the law; empty for laws of hydrotele.
-    """
-
-    renamed = {"of": "variables_from"}
-
-    name: Name
-    axis: Name
-    balance: Balance
-    law: str
-    parameters: Mapping[str, Value] = {}
-    variables_from: dict[str, Name] = {}
-    domain: dict[str, tuple[float, float]] = {}
-    window: tuple[float, float] | None = None
-    play: Play | None = None
-    switch: Switch | None = None
-    uncertainty: NonNegativeFloat | None = None
-    description: str = ""
-    source: str = ""
-
-    @model_validator(mode="after")
-    def _check(self):
-        if self.law not in LAWS and self.source:
-            raise ValueError(
-                f"the law {self.law!r} is defined by {self.source}, which is not loaded: if it is a"
-                " file that you trust, name it on the command line with --effects FILE; if it is a"
-                " plug-in, install it"
-            )
-        if self.law not in LAWS:
-            raise ValueError(f"law {self.law!r} is not known; {suggest_valid_name(self.law, LAWS, _RENAMED_LAWS)}")
-        for variable in self.variables_from:
-            if variable not in DRIVE_VARIABLES:
-                raise ValueError(
-                    f"variables_from: {variable!r} is not a variable of a drive;"
-                    f" {suggest_valid_name(variable, DRIVE_VARIABLES)}"
-                )
-        for variable, (low, high) in self.domain.items():
-            if variable not in VARIABLES:
-                raise ValueError(f"domain: {variable!r} is not a variable; {_suggest_variable(variable)}")
-            if not low < high:
-                raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must be increasing")
-        if self.play and self.switch:
-            raise ValueError("play and switch: a term can have only one of them")
-        for key, memory in (("play", self.play), ("switch", self.switch)):
-            valid = VARIABLES.keys() - {"play_output", "play_difference"}
-            if memory and memory.variable not in valid:
-                known = suggest_valid_name(memory.variable, valid)
-                raise ValueError(f"{key}: {memory.variable!r} is not a variable; {known}")
-        if self.window and not self.window[0] < self.window[1]:
-            raise ValueError("window: [{:g}, {:g}] must be increasing".format(*self.window))
-        LAWS[self.law].encode_parameters(self.parameters)
-        return self

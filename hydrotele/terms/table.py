@@ -21,7 +21,9 @@ from numba.extending import intrinsic
 
 from hydrotele.core.compiled import compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.terms.law import BALANCES, LAWS, VARIABLES, DriveState, Law, Numbers, Term, Variable
+from hydrotele.terms.drive_state import VARIABLES, DriveState
+from hydrotele.terms.law import LAWS, Law, Numbers, Variable
+from hydrotele.terms.term import BALANCES, Term
 
 # numpy integers, since numba compiles a function again for every Python integer literal
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)

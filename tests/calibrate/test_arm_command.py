@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.calibrate.loop import build_loop, closure_error
+from hydrotele.calibrate.calibration_loop import build_loop, closure_error
 from hydrotele.cli.main import app
 from hydrotele.effects.effect import with_value
 from hydrotele.logs.log import save_log

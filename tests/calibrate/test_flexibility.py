@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.arm import identify_arm
+from hydrotele.calibrate.arm_identification import identify_arm
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
+from hydrotele.calibrate.calibration_loop import build_loop
 from hydrotele.calibrate.flexibility import (
     estimate_flexibility,
     refit_with_flexibility,
     relative_lever_arms,
 )
-from hydrotele.calibrate.loop import build_loop
+from hydrotele.calibrate.link_sweeps import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.machine.machine_file import load_machine
 
 ACCURACY = np.radians(0.1)

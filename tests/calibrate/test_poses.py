@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.design import observability_index, select_poses
+from hydrotele.calibrate.pose_selection import observability_index, select_poses
 from hydrotele.core.errors import InputError
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.mukca import (
+from hydrotele.calibrate.socket_calibration import (
     SocketOptions,
     calibrate_sockets,
     check_robot_fits_sockets,
@@ -15,9 +15,9 @@ from hydrotele.calibrate.mukca import (
     move_far_frames_near,
     predict_held_out_place,
 )
-from hydrotele.calibrate.sockets import Socket, load_sockets
+from hydrotele.calibrate.socket_measurement import Socket, load_sockets
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_robot import load_robot
+from hydrotele.kinematics.serial_robot_files import load_robot
 
 DATA = Path(__file__).parents[1] / "data/mukca"
 UR, FACTORY = DATA / "ur_factory/measured", DATA / "ur_factory/factory.urdf"

@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 
 import hydrotele
 from hydrotele.cli import main as cli
-from hydrotele.cli.catalogue import format_items, format_name_lists
-from hydrotele.cli.overview import COMMANDS as SUMMARIES
-from hydrotele.cli.overview import format_program_help
+from hydrotele.cli.list_command import format_items, format_name_lists
+from hydrotele.cli.program_help import COMMANDS as SUMMARIES
+from hydrotele.cli.program_help import format_program_help
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, scenarios_folder
 
@@ -180,7 +180,7 @@ def test_failed_simulation_exits_with_three(monkeypatch, capsys, tmp_path):
     def fail(*_):
         raise SimulationFailed("it went wild at 0.1 s")
 
-    monkeypatch.setattr("hydrotele.cli.running.run_scenario", fail)
+    monkeypatch.setattr("hydrotele.cli.run_command.run_scenario", fail)
     monkeypatch.setattr(sys, "argv", ["hydrotele", "run", "zhu_up", "--out", str(tmp_path / "a")])
     with pytest.raises(SystemExit) as stop:
         cli.main()
@@ -193,7 +193,7 @@ def test_other_runtime_errors_are_not_hidden(monkeypatch):
     def fail(*_):
         raise RuntimeError("a mistake of ours")
 
-    monkeypatch.setattr("hydrotele.cli.catalogue.list_items", fail)
+    monkeypatch.setattr("hydrotele.cli.list_command.list_items", fail)
     monkeypatch.setattr(sys, "argv", ["hydrotele", "list"])
     with pytest.raises(RuntimeError, match="a mistake of ours"):
         cli.main()
@@ -249,7 +249,7 @@ def test_run_replaces_its_own_folder_and_refuses_others(finished, tmp_path):
 
 def test_run_that_cannot_write_says_so_before_it_simulates(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("hydrotele.cli.running.run_scenario", None)  # must not be reached
+    monkeypatch.setattr("hydrotele.cli.run_command.run_scenario", None)  # must not be reached
     code, _, err = invoke("run", "zhu_up", "--out", tmp_path / "file" / "run")
     assert code == 2 and "cannot be created" in err
     monkeypatch.setattr(os, "access", lambda *_: False)
@@ -262,7 +262,7 @@ def test_full_disk_leaves_nothing(broken, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(f"hydrotele.cli.running.{broken}", full)
+    monkeypatch.setattr(f"hydrotele.cli.run_command.{broken}", full)
     code, _, err = invoke("run", "zhu_up", *QUICK, "--out", tmp_path / "run")
     assert code == 2 and "No space left on device" in err and names(tmp_path) == []
 
@@ -445,7 +445,7 @@ def test_summary_of_the_list_has_thirty_lines_and_whole_names(width, whole_list)
 
 
 def test_list_without_a_kind_is_the_summary(whole_list, monkeypatch):
-    monkeypatch.setattr("hydrotele.cli.catalogue.stdout_console.width", 80)
+    monkeypatch.setattr("hydrotele.cli.list_command.stdout_console.width", 80)
     code, out, _ = invoke("list")
     assert code == 0 and len(out.splitlines()) <= 30
     assert all(row["name"] in out for rows in whole_list.values() for row in rows)
@@ -476,7 +476,7 @@ def test_review_writes_every_file_that_is_named(finished, tmp_path, monkeypatch)
         png.write_bytes(b"")
         return ()
 
-    monkeypatch.setattr("hydrotele.show.viewer.take_screenshot", take)
+    monkeypatch.setattr("hydrotele.show.rerun_viewer.take_screenshot", take)
     files = [tmp_path / name for name in ("a.png", "b.png", "c.rrd")]
     options = ["--plot", files[0], "--screenshot", files[1], "--at", 0.25, "--out", files[2]]
     code, out, _ = invoke("review", finished, *options)

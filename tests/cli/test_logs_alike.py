@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.arm_data import read_calibration_logs
-from hydrotele.cli import opening
-from hydrotele.cli.catalogue import LogMachine, validate_files
-from hydrotele.cli.reviewing import ReviewOutputs, replay_logs, review_logs
+from hydrotele.calibrate.calibrator_logs import read_calibration_logs
+from hydrotele.cli import input_logs
+from hydrotele.cli.replay_command import replay_logs
+from hydrotele.cli.review_command import ReviewOutputs, review_logs
+from hydrotele.cli.validate_command import LogMachine, validate_files
 from hydrotele.core.errors import InputError
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
@@ -86,7 +87,7 @@ def test_a_log_is_accepted_with_the_same_notes(case, tmp_path, capsys):
     (tmp_path / "logs").mkdir()
     second = write(tmp_path / "logs" / "other.csv", rig_rows())
     dataset = load_dataset([path, second], RIG)
-    opened = opening.open_logs([path], "rig")
+    opened = input_logs.open_logs([path], "rig")
     shared = [note for note in notes if not note.startswith("gap, identify and compare")]
     assert (shared == []) == (case == "plain")
     assert set(opened.notes) <= set(shared) <= set(dataset.notes)
@@ -127,7 +128,7 @@ def test_folders_are_taken_everywhere(tmp_path, capsys):
     (tmp_path / "logs").mkdir()
     write(tmp_path / "logs" / "only.csv", rig_rows())
     for folder, count in ((tmp_path / "runs", 2), (tmp_path / "runs" / "a", 1), (tmp_path / "logs", 1)):
-        assert len(opening.open_logs([folder], "rig").logs) == count
+        assert len(input_logs.open_logs([folder], "rig").logs) == count
         validate_files([folder], True, LogMachine("rig"))
         assert json.loads(capsys.readouterr().out)[0]["kind"] == "log"
         replay_logs([folder], "rig", None, 1e-3, None, as_json=True)
@@ -139,7 +140,7 @@ def test_folders_are_taken_everywhere(tmp_path, capsys):
 
 def test_recordings_and_gap_folders_open_in_review(tmp_path, monkeypatch):
     shown = []
-    monkeypatch.setattr("hydrotele.cli.reviewing._show", lambda recording, *_, **__: shown.append(recording))
+    monkeypatch.setattr("hydrotele.cli.review_command._show", lambda recording, *_, **__: shown.append(recording))
     recording = tmp_path / "gap_logs" / "recording.rrd"
     recording.parent.mkdir()
     recording.write_bytes(b"RRF2")

@@ -9,7 +9,7 @@ import pytest
 from hydrotele.control.endpoint_force import EndpointForce, endpoint_force_of_log
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry, jacobian
-from hydrotele.kinematics.task import task_jacobian
+from hydrotele.kinematics.task_space import task_jacobian
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import get_sensor_set
 from hydrotele.machine.machine_file import load_machine

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.endpoint_force import (
+from hydrotele.control.gravity_model import (
     extract_slow_motion,
     fit_gravity_to_masses,
     gravity_regressor,
@@ -16,7 +16,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import holding_forces
+from hydrotele.simulate.closed_loops import holding_forces
 from hydrotele.simulate.plant import build_plant, rest_state
 
 CAT = load_machine("cat215", "bucket")

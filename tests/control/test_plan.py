@@ -5,14 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from hydrotele.control.arm_kinematics import pose_to_joints
 from hydrotele.control.plan import make_plan, quintic_step, tip_moves_duration
-from hydrotele.control.resolved_motion import pose_to_joints
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.kinematics.arm import forward_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.kinematics.arm_dimensions import arm_geometry
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.scenario.scenario import Pose, Scenario
+from hydrotele.scenario.pilots import Pose
+from hydrotele.scenario.scenario import Scenario
 
 RATE = 200.0
 

@@ -7,19 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.control.resolved_motion import (
-    ResolvedMotion,
-    arm_axes,
-    arm_specification,
-    pose_to_joints,
-    step_references_by_rate,
-)
+from hydrotele.control.arm_kinematics import arm_axes, arm_specification, pose_to_joints
+from hydrotele.control.resolved_motion import ResolvedMotion, step_references_by_rate
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import forward_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.kinematics.task import compute_tip_pose
+from hydrotele.kinematics.arm_dimensions import arm_geometry
+from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.scenario.scenario import Pose
+from hydrotele.scenario.pilots import Pose
 
 BUCKET = load_machine("cat215", "bucket")
 GEOMETRY = arm_geometry(BUCKET)

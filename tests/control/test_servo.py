@@ -15,9 +15,9 @@ from hydrotele.control.servo import (
     servo_parameters,
     servo_step,
 )
+from hydrotele.hydraulics.actuator_layout import actuator_parameters
 from hydrotele.hydraulics.circuit import Slot, chamber_flows
 from hydrotele.hydraulics.laws import valve_opening
-from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, Servo

@@ -238,8 +238,8 @@ def test_bar_shows_the_fraction():
 ELSEWHERE = """
 import numpy as np
 from hydrotele.core import compiled
-from hydrotele.simulate.closure import max_pin_opening
-code = "import numpy as np; from hydrotele.simulate.closure import max_pin_opening as f"
+from hydrotele.simulate.closed_loops import max_pin_opening
+code = "import numpy as np; from hydrotele.simulate.closed_loops import max_pin_opening as f"
 code += "; f(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))"
 for _ in range(2):
     compiled.compile_in_background(max_pin_opening, code)

@@ -13,7 +13,7 @@ from numba.core.errors import TypingError
 
 import hydrotele
 from hydrotele.core.compiled import compile_without_allocation, compiled
-from hydrotele.core.references import MAX_ARGUMENTS_BY_VALUE, Reference
+from hydrotele.core.tuple_references import MAX_ARGUMENTS_BY_VALUE, Reference
 
 PACKAGE = Path(hydrotele.__file__).parent
 

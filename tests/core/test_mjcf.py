@@ -12,7 +12,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.core.mjcf import copy_mjcf, load_model
 from hydrotele.gap.patched import Patch, patched_mjcf
-from hydrotele.kinematics.serial_robot import load_robot
+from hydrotele.kinematics.serial_robot_files import load_robot
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain

@@ -4,13 +4,15 @@ import dataclasses
 
 import pytest
 
-from hydrotele.calibrate.hybrid_data import SensorNoise
+from hydrotele.calibrate.hybrid_measurement import SensorNoise
 from hydrotele.core.datafile import StrictModel, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.identify.mechanism import ColumnMapping
 from hydrotele.machine.drives import ElectricMotor, LoadCylinder
 from hydrotele.machine.joystick import AxisGains, Detent, Joystick
-from hydrotele.scenario.scenario import LogOnGround, StandingTree, TablePilot, load_scenario
+from hydrotele.scenario.pilots import TablePilot
+from hydrotele.scenario.scenario import load_scenario
+from hydrotele.scenario.surrounding_objects import LogOnGround, StandingTree
 from hydrotele.scenario.teleoperation import (
     ButtonCommand,
     Channel,
@@ -20,9 +22,9 @@ from hydrotele.scenario.teleoperation import (
     TeleopPilot,
     TipOver,
 )
-from hydrotele.teleop.analysis import ImpedanceRange, MapRange, StiffnessFeedbackAxis, TeleopCaseFile
+from hydrotele.teleop.case_file import ImpedanceRange, MapRange, StiffnessFeedbackAxis, TeleopCaseFile
 from hydrotele.teleop.operator_parameters import ArmParameters, Operator
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 STIFFNESS = "nominal: nominal_stiffness, least: min_stiffness, most: max_stiffness"
 RENAMED = {

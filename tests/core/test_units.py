@@ -5,7 +5,7 @@ import math
 import pytest
 
 from hydrotele.core.units import UNITS, display_unit, plot_axis_unit, si_unit_and_factor
-from hydrotele.machine import signals
+from hydrotele.machine import log_channels
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,9 @@ def test_conversion_to_si(unit, si, factor):
 
 
 def test_units_of_channels_are_si_and_every_unit_leads_to_one():
-    known = {u for table in (signals.MEASURED_KINDS, signals.TRUTH_KINDS) for k in table.values() for u in k.units}
+    known = {
+        u for table in (log_channels.MEASURED_KINDS, log_channels.TRUTH_KINDS) for k in table.values() for u in k.units
+    }
     assert not known & UNITS.keys()
     assert not {si for si, _ in UNITS.values()} & UNITS.keys()
 

@@ -5,8 +5,8 @@ import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.feedback import simulate_readings
 from hydrotele.simulate.plant import build_plant, rest_state
+from hydrotele.simulate.sensor_models import simulate_readings
 
 MACHINE = load_machine("calibrator")
 ELBOW = "angle.calibrator_elbow"

@@ -8,7 +8,7 @@ import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import holding_forces, independent_dofs, motion_basis
+from hydrotele.simulate.closed_loops import holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 G = 9.81

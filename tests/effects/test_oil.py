@@ -8,7 +8,7 @@ from hydrotele.effects import apply_effect
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import compute_state_flows_and_forces
+from hydrotele.simulate.true_values import compute_state_flows_and_forces
 
 BOOM = 1  # place of the boom among the axes of the CAT 215
 NOMINAL = load_machine("cat215")

@@ -20,7 +20,8 @@ from hydrotele.effects.effect import Effect
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.terms.law import LAWS, DriveState
+from hydrotele.terms.drive_state import DriveState
+from hydrotele.terms.law import LAWS
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")

@@ -13,14 +13,9 @@ from hydrotele.run.replay import replay_log
 from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import (
-    Recorder,
-    delayed_channels,
-    split_delay,
-    start_leapfrog,
-    true_channels,
-)
+from hydrotele.simulate.record import Recorder, split_delay, start_leapfrog
 from hydrotele.simulate.stepping import Stepper
+from hydrotele.simulate.true_values import delayed_channels, true_channels
 
 
 def planted(*effects):
@@ -218,7 +213,7 @@ def test_the_controller_sees_what_the_log_shows():
     """Same defects, noise and converter in the fed-back reading and in the log's row."""
     asked = scenario(*DEFECTS, sensors="khoshzaban1992")
     measured = run_scenario(asked).measured
-    plant, data, plan, seen = prepare_run(asked)
+    plant, data, plan, seen, _ = prepare_run(asked)
     start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, 20)
     for tick in range(50):

@@ -14,7 +14,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.simulate.closure import holding_forces, independent_dofs
+from hydrotele.simulate.closed_loops import holding_forces, independent_dofs
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
 from hydrotele.simulate.record import current_aligned_positions, start_leapfrog
 

@@ -10,12 +10,12 @@ from hydrotele.envs.controllers.catalogue import (
     make_controller,
 )
 from hydrotele.envs.controllers.controller import find_observation_columns
-from hydrotele.envs.controllers.track import ReferencePreview, make_track_controller
-from hydrotele.envs.core import TaskCore
+from hydrotele.envs.controllers.tracking import ReferencePreview, make_track_controller
 from hydrotele.envs.episode import DISABLED, SAME_STEP
-from hydrotele.envs.making import TASKS
+from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.task import Options
-from hydrotele.envs.track import PREVIEW_TIMES, compute_axis_reference
+from hydrotele.envs.task_catalogue import TASKS
+from hydrotele.envs.track_trajectory import PREVIEW_TIMES, compute_axis_reference
 
 _SHORT = Options(variants=2, duration=3.0)
 

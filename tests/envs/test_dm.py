@@ -11,7 +11,7 @@ from dm_env import test_utils
 import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs import dm
-from hydrotele.envs.making import MachineEnv
+from hydrotele.envs.gymnasium_env import MachineEnv
 
 SHORT = {"duration": 0.2, "variants": 2}
 

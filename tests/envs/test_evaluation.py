@@ -5,12 +5,12 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.catalogue import make_controller
-from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP
+from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.evaluation import evaluate_controller, tabulate_scores
-from hydrotele.envs.making import TASKS
 from hydrotele.envs.stable_baselines import AgentInterface, find_reference_and_measured_columns
 from hydrotele.envs.task import Options
+from hydrotele.envs.task_catalogue import TASKS
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 

@@ -9,11 +9,9 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import find_observation_columns
 from hydrotele.envs.controllers.grade import DUMP, GradeController
-from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.grade import (
-    CELL_COUNT,
-    CELL_LENGTH,
     ERROR_PER_REWARD,
     FAILURE_DEPTH,
     FAILURE_REWARD,
@@ -25,19 +23,17 @@ from hydrotele.envs.grade import (
     MIN_RADIUS,
     PLANE_HEIGHT,
     PLANE_SLOPE,
-    PROFILE_START,
     SECTION_COUNT,
     SOIL_INDEX,
     SUCCESS_REWARD,
-    TERRAIN_SIZE,
     TIME_COST,
-    pack_soil_bed_parameters,
     profile_section_radii,
 )
-from hydrotele.envs.making import TASKS
+from hydrotele.envs.soil_bed import CELL_COUNT, CELL_LENGTH, PROFILE_START, TERRAIN_SIZE, pack_soil_bed_parameters
 from hydrotele.envs.task import Options
-from hydrotele.kinematics.task import REACHED, solve_joint_angles
-from hydrotele.soil.facts import (
+from hydrotele.envs.task_catalogue import TASKS
+from hydrotele.kinematics.task_space import REACHED, solve_joint_angles
+from hydrotele.soil.parameters import (
     CARRIED_VOLUME,
     CAT215,
     DENSITY,

@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode
 import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS
-from hydrotele.envs.facts import TASK_CODES
-from hydrotele.envs.making import TASKS
+from hydrotele.envs.task_catalogue import TASKS
+from hydrotele.envs.task_parameters import TASK_CODES
 
 TRACK = "hydrotele/TrackTrajectory-v0"
 SHORT = {"duration": 0.1, "variants": 3}

@@ -9,7 +9,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.dm import load
-from hydrotele.envs.making import MachineEnv, MachineVectorEnv
+from hydrotele.envs.gymnasium_env import MachineEnv, MachineVectorEnv
 
 TASK = "TrackTrajectory"
 

@@ -16,9 +16,9 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 
 import hydrotele.envs
 from hydrotele.core.errors import InputError
-from hydrotele.envs.making import MachineEnv, MachineVectorEnv
-from hydrotele.envs.stage import TaskRenderer, make_goal_markers
-from hydrotele.show.canvas import Canvas
+from hydrotele.envs.gymnasium_env import MachineEnv, MachineVectorEnv
+from hydrotele.envs.rendering import TaskRenderer, make_goal_markers
+from hydrotele.show.offscreen_renderer import Canvas
 
 
 def set_nightly(cases, daily):
@@ -278,7 +278,7 @@ def test_nothing_is_drawn_unasked_and_no_driver_says_what_to_install():
     An environment that is stepped without pictures brings no OpenGL along.
     """
     code = (
-        "import sys\nfrom hydrotele.envs.making import MachineEnv\n"
+        "import sys\nfrom hydrotele.envs.gymnasium_env import MachineEnv\n"
         "env = MachineEnv('TrackTrajectory', variants=1)\nenv.reset(seed=1)\n"
         "env.step(env.action_space.sample())\nprint('OpenGL' in sys.modules)\n"
         "env = MachineEnv('TrackTrajectory', 'rgb_array', variants=1); env.reset(seed=1)\n"

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="the extra `learn` is not installed")
 
-from hydrotele.envs.making import MachineVectorEnv  # noqa: E402 - after the skip
+from hydrotele.envs.gymnasium_env import MachineVectorEnv  # noqa: E402 - after the skip
 from hydrotele.envs.stable_baselines import StableVecEnv  # noqa: E402 - after the skip
 
 _SHORT = {"variants": 2, "duration": 0.1}

@@ -5,10 +5,10 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.catalogue import make_controller
-from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import ACTIONS, DISABLED
-from hydrotele.envs.making import TASKS
+from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.task import Options
+from hydrotele.envs.task_catalogue import TASKS
 
 COUNT = 2
 

@@ -11,8 +11,8 @@ from hydrotele.estimate import evidence as evidence_module
 from hydrotele.estimate.evidence import MIDDLE, Evidence, _beyond_dents, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.track import COARSE
-from hydrotele.machine.machine import SensorError
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.sensors import SensorError
 from tests.estimate.test_filter import machine_data
 
 

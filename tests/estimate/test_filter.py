@@ -14,7 +14,7 @@ from hydrotele.estimate.reduced_model import (
     state_names,
 )
 from hydrotele.estimate.track import steps_per_row, track_run
-from hydrotele.hydraulics.parameters import actuator_order
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine

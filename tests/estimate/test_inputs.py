@@ -7,7 +7,7 @@ from hydrotele.estimate.filter import SUPPLY, Input, input_columns, possible_inp
 from hydrotele.estimate.reduced_model import advance, model_space, reduced_model, state_names
 from hydrotele.estimate.track import track_run
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 from tests.estimate.test_filter import PERIOD, machine_data
 
 _STEPS = 20

@@ -19,7 +19,7 @@ from hydrotele.estimate.output_error import (
     timing,
     uncertain_parameters,
 )
-from hydrotele.kinematics.from_machine import axis_linkage, joint_range_at_drive
+from hydrotele.kinematics.drive_linkage import axis_linkage, joint_range_at_drive
 from hydrotele.logs.dataset import RunData, load_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.drives import FlowCurve, Metering

@@ -10,12 +10,12 @@ from hydrotele.estimate.filter import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
-from hydrotele.hydraulics.parameters import max_pump_drive_time_step
+from hydrotele.hydraulics.actuator_layout import max_pump_drive_time_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import RunRows, average_rows
+from hydrotele.logs.resampling import RunRows, average_rows
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 CHANNELS = ("position.piston", "pressure_head.piston", "pressure_rod.piston")
 NOISE = np.array([1.0e-5, 2.0e4, 5.0e4])

@@ -7,13 +7,13 @@ import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, state_names
+from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, Slot
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.hydraulics.parameters import SLOT_COUNT, Slot
 from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine_file import save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 PERIOD = 0.02
 ROWS = 50  # 1 s

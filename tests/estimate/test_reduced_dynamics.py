@@ -23,17 +23,9 @@ from hydrotele.estimate.reduced_model import (
 )
 from hydrotele.hydraulics.circuit import SLOT_COUNT, Slot, actuator_friction
 from hydrotele.logs.log import load_log
-from hydrotele.machine.machine import SensorError
-from hydrotele.multibody.reduced_mechanism import (
-    BIAS,
-    COM,
-    DAMPING,
-    MASS,
-    ORIGIN,
-    RATE,
-    ROTATION,
-    compute_mass_and_bias,
-)
+from hydrotele.machine.sensors import SensorError
+from hydrotele.multibody.reduced_dynamics import BIAS, ORIGIN, RATE, ROTATION, compute_mass_and_bias
+from hydrotele.multibody.reduced_mechanism import COM, DAMPING, MASS
 from tests.measured import TRUTH
 
 PERIOD, RELIEF = 0.02, 28.0e6

@@ -7,9 +7,9 @@ import pytest
 
 from hydrotele.effects import Term, with_terms, with_value
 from hydrotele.estimate.reduced_model import simulate_rows
+from hydrotele.hydraulics.actuator_layout import actuator_order, actuator_parameters
 from hydrotele.hydraulics.circuit import NO_EXTRA_STATES, circuit_scratch, step_circuit
-from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import encode_terms_table
 
 PERIOD = 0.02

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lsim, lti
 
 from hydrotele.estimate.reduced_model import advance, follow_channel, simulate_rows
-from hydrotele.machine.machine import SensorError, step_first_order_lag
+from hydrotele.machine.sensors import SensorError, step_first_order_lag
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e-3, 0.3, 1.0, 50.0])

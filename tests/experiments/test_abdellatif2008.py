@@ -6,9 +6,9 @@ from scipy.stats import chi2, ncx2
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import abdellatif2008 as study
+from hydrotele.experiments import abdellatif_base_parameters
 from hydrotele.experiments import abdellatif_processing as processing
 from hydrotele.experiments import abdellatif_trials as trials
-from hydrotele.experiments import palida_base
 from hydrotele.experiments.comparison import FAULT_REPETITIONS, Experiment
 from hydrotele.experiments.palida import (
     CHI2_LIMIT,
@@ -19,13 +19,11 @@ from hydrotele.experiments.palida import (
     load_excitation,
     load_robot,
     make_drive_limits,
-    plan_circle,
-    plan_square,
     simulate_excitation,
     simulate_measurement,
-    track_path,
 )
-from hydrotele.identify.estimation import estimate_linear_parameters
+from hydrotele.experiments.palida_control import plan_circle, plan_square, track_path
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters
 
 ITEMS = (
     "Table 1", "Table 2", "Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Fig. 5", "Fig. 6", "Fig. 7",
@@ -62,9 +60,9 @@ def test_unknown_settings_are_refused(one):
 
 
 def test_null_space_rules_and_table_1_give_the_same_base_parameters():
-    rows = judge_repeatedly(palida_base.STRUCTURE, 1)
+    rows = judge_repeatedly(abdellatif_base_parameters.STRUCTURE, 1)
     assert {row.verdict for row in rows.values()} == {"agrees"}
-    values = palida_base.compare_base_parameter_methods(1, {}).values
+    values = abdellatif_base_parameters.compare_base_parameter_methods(1, {}).values
     # independent of Table 1: 13 parameters per leg and 10 of the platform, for any bodies
     assert values["rank, 19 bodies"] == values["rules, 19 bodies"] == 6 * 13 + 10
 
@@ -75,7 +73,7 @@ def test_null_space_rules_and_table_1_give_the_same_base_parameters():
      ("regrouping rules", {"platform_rule": False})],
 )  # fmt: skip
 def test_wrong_base_parameters_are_found(name, changes):
-    assert judge_repeatedly(palida_base.STRUCTURE, 1, changes)[name].verdict == "differs"
+    assert judge_repeatedly(abdellatif_base_parameters.STRUCTURE, 1, changes)[name].verdict == "differs"
 
 
 def test_moved_frame_leaves_the_kinetic_energy():
@@ -85,10 +83,10 @@ def test_moved_frame_leaves_the_kinetic_energy():
     rotation *= np.sign(np.linalg.det(rotation))
     offset, spin, speed = rng.normal(size=(3, 3))
     body = np.array([2.0, 0.3, -0.2, 0.5, 1.0, 0.1, -0.2, 1.5, 0.05, 1.2])
-    carrier = palida_base.compute_inertial_transformation(rotation, offset) @ body
+    carrier = abdellatif_base_parameters.compute_inertial_transformation(rotation, offset) @ body
 
     def energy(parameters, spin, speed):
-        tensor = palida_base._build_inertia_tensor(parameters[4:])
+        tensor = abdellatif_base_parameters._build_inertia_tensor(parameters[4:])
         return (0.5 * parameters[0] * speed @ speed + speed @ np.cross(spin, parameters[1:4])
                 + 0.5 * spin @ tensor @ spin)  # fmt: skip
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.cli import experimenting
+from hydrotele.cli import experiments_command
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
@@ -24,7 +24,7 @@ from hydrotele.experiments.comparison import (
     run_with_faults,
     summarize_verdicts,
 )
-from hydrotele.experiments.intervals import (
+from hydrotele.experiments.statistical_checks import (
     check_bootstrapped_statistic,
     check_deterministic_value,
     check_fraction,
@@ -137,7 +137,7 @@ def test_processes_give_the_same_samples():
 
 
 def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
-    monkeypatch.setattr(experimenting, "load_experiment_series", lambda name: SERIES)
+    monkeypatch.setattr(experiments_command, "load_experiment_series", lambda name: SERIES)
     folder = tmp_path / "results"
     asked = ["experiments", "wang2012", "--jobs", "1", "--out", str(folder)]
     result = CliRunner().invoke(app, asked)
@@ -159,7 +159,7 @@ def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
 def test_a_difference_is_the_exit_status(monkeypatch):
     check = check_deterministic_value("length", 2.0, (2.9, 3.1), "")
     long = Claim("length", "3 m", "p. 1", "document", lambda samples: Evaluation((check,)))
-    monkeypatch.setattr(experimenting, "load_experiment_series", lambda name: Series(
+    monkeypatch.setattr(experiments_command, "load_experiment_series", lambda name: Series(
         "wang2012", "", 1, (Experiment("lengths", measure_length, (long,)),)))  # fmt: skip
     result = CliRunner().invoke(app, ["experiments", "wang2012", "--json", "--jobs", "1"])
     assert result.exit_code == 1
@@ -168,4 +168,4 @@ def test_a_difference_is_the_exit_status(monkeypatch):
 
 def test_unknown_document_is_refused():
     with pytest.raises(InputError, match="valid: abdellatif2008, khoshzaban1992, wang2012, zhu"):
-        experimenting.experiments_to_folder("parker1992", None, 1, 1, True)
+        experiments_command.experiments_to_folder("parker1992", None, 1, 1, True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.experiments import khoshzaban_arm, khoshzaban_experiment, khoshzaban_machine
+from hydrotele.experiments import khoshzaban_arm, khoshzaban_calibration_claims, khoshzaban_machine
 from hydrotele.experiments.comparison import FAULT_REPETITIONS, Sample
 from hydrotele.experiments.khoshzaban1992 import SERIES
 from hydrotele.experiments.khoshzaban_arm import (
@@ -20,7 +20,7 @@ from hydrotele.experiments.khoshzaban_arm import (
     measure_exact_readings,
 )
 from hydrotele.experiments.khoshzaban_calibration import measure_bend_detection, measure_calibration_errors
-from hydrotele.experiments.khoshzaban_experiment import (
+from hydrotele.experiments.khoshzaban_calibration_claims import (
     compute_accepted_ratio_range,
     measure_printed_end_point_errors,
 )
@@ -172,7 +172,7 @@ def test_bent_joints_are_left_out_and_leave_smaller_errors():
     assert values["inside.6"] > 10.0 * values["outside.6"]
     before, after = (abs(values[f"{m}.error.alpha.stick"]) for m in ("identified", "reidentified"))
     assert before > np.radians(1.0) > after
-    claims = {claim.name: claim for claim in khoshzaban_experiment.EXPERIMENTS[1].claims}
+    claims = {claim.name: claim for claim in khoshzaban_calibration_claims.EXPERIMENTS[1].claims}
     labels = {panel.label for panel in measure_calibration_errors(1, {"poses": 0.1}).panels}
     for claim in claims.values():
         assert set(claim.panel_labels or ()) <= labels, claim.name

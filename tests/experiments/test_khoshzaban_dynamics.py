@@ -21,7 +21,7 @@ from hydrotele.experiments.khoshzaban_dynamics import (
     TABLES_AND_FIGURES,
     UNAVAILABLE,
 )
-from hydrotele.experiments.khoshzaban_models import (
+from hydrotele.experiments.khoshzaban_regressors import (
     find_base_parameters,
     make_regressor,
     make_thesis_regressor_setup,

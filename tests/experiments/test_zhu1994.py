@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.experiments import zhu_felling, zhu_forces, zhu_motion, zhu_tables
+from hydrotele.experiments import zhu_contact_forces, zhu_felling, zhu_free_motion, zhu_tables
 from hydrotele.experiments.comparison import Sample, run_with_faults
 from hydrotele.experiments.zhu1994 import SERIES
 
@@ -104,7 +104,7 @@ def test_unknown_changes_are_refused():
     with pytest.raises(InputError):
         zhu_tables.measure_tables(1, {"faktor": "2"})
     with pytest.raises(InputError):
-        zhu_motion.measure_line("in", 1, {"pilot.modus": "rate"})
+        zhu_free_motion.measure_line("in", 1, {"pilot.modus": "rate"})
 
 
 @pytest.mark.nightly
@@ -116,13 +116,13 @@ def test_centring_force_is_a_line_and_detents_are_not():
     rows = SERIES.claims["conventional centring force"], SERIES.claims["detents"]
     assert rows[0].fault == {"pilot.detent": "true"} and rows[1].fault == {"pilot.detent": "false"}
     for detent, verdicts in (("false", ("agrees", "differs")), ("true", ("differs", "undecided"))):
-        samples = [zhu_motion.measure_handle_force_curve(detent, seed, {}) for seed in (1, 2, 3)]
+        samples = [zhu_free_motion.measure_handle_force_curve(detent, seed, {}) for seed in (1, 2, 3)]
         assert tuple(row.compare(samples).verdict for row in rows) == verdicts
 
 
 def test_a_line_is_straight():
     claim = SERIES.claims["straight line in"]
-    sample = zhu_motion.measure_line("in", 1, {})
+    sample = zhu_free_motion.measure_line("in", 1, {})
     assert claim.compare([sample, sample]).verdict == "agrees"
     stray = Sample(dict(sample.values) | {"stray_share": 0.05})
     assert claim.compare([stray, stray]).verdict == "differs"
@@ -130,7 +130,7 @@ def test_a_line_is_straight():
 
 @pytest.mark.nightly
 def test_direct_force_is_unstable_when_large():
-    assert zhu_forces.measure_direct_feedback(4.0e-4, 1, {}).values["ripple"] > 0.5
+    assert zhu_contact_forces.measure_direct_feedback(4.0e-4, 1, {}).values["ripple"] > 0.5
 
 
 _CASES = ("rate", "calm", "fast", "slow_rate", "slow_position")

@@ -20,9 +20,9 @@ from hydrotele.gap.result import (
 )
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
+from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_channel_unit
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}
 _PERIOD, _ROWS, _LOUD = 0.02, 400, slice(150, 230)

@@ -20,11 +20,12 @@ from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
 from hydrotele.gap.law_tables import Table, lack_regression
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
-from hydrotele.machine.machine import SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.machine.log_channels import default_channel_unit
+from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_channel_unit
+from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 from tests.estimate.test_filter import machine_data
 from tests.measured import MEASURED
 

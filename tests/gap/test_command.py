@@ -130,7 +130,7 @@ def test_an_interrupted_search_keeps_its_best_answer_and_says_where(site, search
     whole = sys.modules["hydrotele.gap.find"].__dict__["find_gap"]
     monkeypatch.setitem(sys.modules["hydrotele.gap.find"].__dict__, "find_gap", stopped)
     printed = []
-    monkeypatch.setattr("hydrotele.cli.gapping.stderr_console.print", lambda text, **_: printed.append(text))
+    monkeypatch.setattr("hydrotele.cli.gap_command.stderr_console.print", lambda text, **_: printed.append(text))
     assert invoke("gap", "--data", "site", "--no-recording", "--out", "here")[0] != 0
     assert names(site) == ["here.interim", "site"], "the final folder appears whole or not at all"
     assert any("best answer so far is in here.interim" in text for text in printed)

@@ -39,8 +39,9 @@ from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.terms.law import Drives, DriveState, Term
+from hydrotele.terms.drive_state import Drives, DriveState
 from hydrotele.terms.table import FORCE, PLAY, SWITCH, encode_terms_table, sum_terms, update_term_state
+from hydrotele.terms.term import Term
 from tests.estimate.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 7.0

@@ -9,7 +9,7 @@ import yaml
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.experiment import MOTIONS, OF_EFFECT, OF_LAW, next_experiment
 from hydrotele.kinematics.arm import forward_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.kinematics.arm_dimensions import arm_geometry
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

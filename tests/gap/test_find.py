@@ -21,7 +21,8 @@ from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.gap.search import Found
-from hydrotele.logs.dataset import Dataset, load_dataset, select_exciting_segments
+from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import MEASURED

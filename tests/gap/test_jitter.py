@@ -17,7 +17,7 @@ from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.feedback import simulate_readings
+from hydrotele.simulate.sensor_models import simulate_readings
 
 SITE, JITTER = "khoshzaban1992", 0.003
 

@@ -16,10 +16,10 @@ from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.patched import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
 from hydrotele.identify.record import IdentificationRecord
-from hydrotele.machine.machine import SensorError
+from hydrotele.machine.sensors import SensorError
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.inverse_dynamics import project_on_drives
-from hydrotele.simulate.driven_chain import open_loop_errors
+from hydrotele.simulate.open_loop_prediction import open_loop_errors
 from tools.validation.blind import hexapod
 
 ARM = """\

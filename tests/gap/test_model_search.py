@@ -12,7 +12,8 @@ from hydrotele.gap.find import find_gap
 from hydrotele.gap.model_search import scale_residual_inputs
 from hydrotele.gap.profiles import find_profiles
 from hydrotele.gap.result import gap_document
-from hydrotele.logs.dataset import load_dataset, select_exciting_segments
+from hydrotele.logs.dataset import load_dataset
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import MEASURED
 

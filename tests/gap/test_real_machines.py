@@ -17,7 +17,8 @@ from hydrotele.estimate.hypothesis import hypotheses
 from hydrotele.gap import find
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.dataset import load_dataset, select_exciting_segments
+from hydrotele.logs.dataset import load_dataset
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
 from tools.validation.real_machines import (

@@ -10,13 +10,8 @@ import numpy as np
 import pytest
 
 from hydrotele.show import gap_report
-from hydrotele.show.gap_recording import (
-    channel_rms,
-    find_gap_windows,
-    find_most_improved_channels,
-    windowed_errors,
-)
 from hydrotele.show.gap_report import write_report
+from hydrotele.show.prediction_errors import channel_rms, find_gap_windows, find_most_improved_channels, windowed_errors
 
 _VOID = {"meta", "img", "line", "circle", "rect", "i", "br"}
 

@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from hydrotele.cli.haptic import describe_computer_timing
+from hydrotele.cli.haptic_device_command import describe_computer_timing
 from hydrotele.haptics import timing
 from hydrotele.haptics.timing import (
     HISTOGRAM_EDGES_US,

@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hydrotele.gap.balances import chamber_residuals
+from hydrotele.hydraulics.actuator_layout import actuator_parameters
 from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SLOT_COUNT,
@@ -21,9 +22,8 @@ from hydrotele.hydraulics.laws import (
     pressure_with_released_air,
     pressure_without_released_air,
 )
-from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import NO_TERMS
 
 BOOM = 1

@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from hydrotele.hydraulics.actuator_layout import actuator_parameters
 from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SLOT_COUNT,
@@ -17,9 +18,8 @@ from hydrotele.hydraulics.circuit import (
     step_circuit,
 )
 from hydrotele.hydraulics.laws import relief_and_makeup_flow
-from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import NO_TERMS
 
 SWING, BOOM, STICK = range(3)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from hydrotele.hydraulics import circuit, supply
+from hydrotele.hydraulics import circuit, supply, valve
 from hydrotele.hydraulics import laws as hydraulics
 from hydrotele.hydraulics.laws import (
     friction_force,
@@ -34,7 +34,7 @@ def laws(module):
     }
 
 
-LAWS = {f"{m.__name__}.{n}": f for m in (hydraulics, supply, circuit) for n, f in laws(m).items()}
+LAWS = {f"{m.__name__}.{n}": f for m in (hydraulics, valve, supply, circuit) for n, f in laws(m).items()}
 
 
 def section(text, title):

@@ -13,6 +13,7 @@ from hydrotele.hydraulics.actuator import (
     implicit_bristle_friction,
     sliding_friction,
 )
+from hydrotele.hydraulics.actuator_layout import actuator_parameters, extra_state_names
 from hydrotele.hydraulics.circuit import (
     SCRATCH_SIZE,
     Slot,
@@ -21,11 +22,10 @@ from hydrotele.hydraulics.circuit import (
     demanded_flow_fraction,
     step_circuit,
 )
-from hydrotele.hydraulics.parameters import actuator_parameters, extra_state_names
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import NO_TERMS
 
 COULOMB, STRIBECK, SLOW, UNEQUAL = 150.0, 50.0, 0.02, 0.2

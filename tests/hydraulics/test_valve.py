@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+from hydrotele.hydraulics.actuator_layout import Slot, actuator_parameters
 from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SLOT_COUNT,
@@ -16,18 +17,11 @@ from hydrotele.hydraulics.circuit import (
     compute_supply_pressure_derivatives,
     step_circuit,
 )
-from hydrotele.hydraulics.laws import (
-    axis_valve_opening,
-    chamber_flows,
-    counterbalance_opening,
-    end_stop_force,
-    spool_step,
-    valve_opening,
-)
-from hydrotele.hydraulics.parameters import Slot, actuator_parameters
+from hydrotele.hydraulics.laws import counterbalance_opening, end_stop_force, spool_step, valve_opening
+from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import Drives
+from hydrotele.terms.drive_state import Drives
 from hydrotele.terms.table import NO_TERMS
 
 CAT = load_machine("cat215", "none")

@@ -7,15 +7,15 @@ from scipy.stats import chi2
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
 from hydrotele.identify.record import build_records, keep_beginning
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.estimation import estimate_linear_parameters, fit_autoregression
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters, fit_autoregression
 
 TRUTH = np.array([95.0, 200.0, 20.0, -3.0])
 

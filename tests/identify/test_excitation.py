@@ -12,11 +12,11 @@ from hydrotele.identify.excitation import (
     select_determinable_parameters,
 )
 from hydrotele.identify.record import compute_force_noise
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.motion import filter_periodic
-from hydrotele.identify.smoothing import filter_zero_phase, smooth_and_differentiate
+from hydrotele.identify.joint_motion import filter_periodic
+from hydrotele.identify.optimal_smoother import smooth_and_differentiate
+from hydrotele.identify.zero_phase_filter import filter_zero_phase
 
 DT = 0.02
 

@@ -13,12 +13,8 @@ from hydrotele.identify.identifiability import (
 )
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import (
-    FrictionTerm,
-    make_regressor,
-    passive_friction_terms,
-    project_on_drives,
-)
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import FrictionTerm, make_regressor, passive_friction_terms
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.multibody.test_inverse_dynamics import panda
 

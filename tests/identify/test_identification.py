@@ -9,14 +9,14 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identifiability import STATUS_FULL, STATUS_WEAK
 from hydrotele.identify.identification import identify_dynamics, identify_with_friction_shapes
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
 from hydrotele.identify.record import build_records, keep_beginning
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.identify.result import count_statuses, parameter_rows
-from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tests.measured import MEASURED, REAL, needs_real
 
 

@@ -6,21 +6,19 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import with_value
-from hydrotele.identify.estimation import Estimate
+from hydrotele.identify.consistent_parameters import AllowedDeformation, find_consistent_parameters
 from hydrotele.identify.identifiability import classify_parameters
-from hydrotele.identify.identified_machine import (
-    AllowedDeformation,
-    build_identified_machine,
-    find_consistent_parameters,
-)
+from hydrotele.identify.identified_machine import build_identified_machine
+from hydrotele.identify.linear_least_squares import Estimate
+from hydrotele.identify.regressor_setup import machine_setup, map_cylinder_bodies
 from hydrotele.identify.result import (
     HeldOutForces,
     Identification,
 )
-from hydrotele.identify.setup import machine_setup, map_cylinder_bodies
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, make_regressor, project_on_drives
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import BODY_PARAMETERS, make_regressor
 from hydrotele.simulate.plant import build_plant, rest_state
 
 

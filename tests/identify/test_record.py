@@ -7,13 +7,13 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.record import build_records
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import SensorError
+from hydrotele.logs.run_files import RunFiles
+from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_channel_unit
+from hydrotele.machine.sensors import SensorError
 
 ROWS = 600
 AXES = {"swing": 0.1, "boom": 0.45, "stick": -1.6}

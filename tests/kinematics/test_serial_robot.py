@@ -12,14 +12,11 @@ from hydrotele.kinematics.serial_robot import (
     correction_names,
     expand_mimic_joints,
     frame_from_rpy,
-    load_robot,
     robot_chain,
-    robot_to_yaml,
     rotation_to_rpy,
-    shipped_robots,
     solve_joints_for_ball,
-    write_origins_to_urdf,
 )
+from hydrotele.kinematics.serial_robot_files import load_robot, robot_to_yaml, shipped_robots, write_origins_to_urdf
 
 URDF = """<robot name="two">
   <link name="world"/><link name="base"/><link name="arm"/><link name="hand"/><link name="ball"/>

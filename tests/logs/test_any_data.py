@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.cleaning import find_readings_without_update, readings_per_update
+from hydrotele.logs.clock import fit_clock
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.faulty_readings import find_readings_without_update, readings_per_update
 from hydrotele.logs.log import Log, save_log
-from hydrotele.logs.rows import MaskedInterval, RunRows, average_rows, fit_clock, read_mask
-from hydrotele.machine.machine import Sensor, SensorSet
+from hydrotele.logs.masked_intervals import MaskedInterval, read_mask
+from hydrotele.logs.resampling import RunRows, average_rows
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine_file import load_machine, save_machine
+from hydrotele.machine.sensors import Sensor, SensorSet
 
 RIG = load_machine("rig")
 STATED = {"machine": "rig", "sensors": "laboratory"}

@@ -9,9 +9,10 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.dataset import load_dataset
-from hydrotele.logs.files import RunFiles, read_runs
 from hydrotele.logs.log import load_log
-from hydrotele.logs.rows import MaskedInterval, merge_run
+from hydrotele.logs.masked_intervals import MaskedInterval
+from hydrotele.logs.resampling import merge_run
+from hydrotele.logs.run_files import RunFiles, read_runs
 from hydrotele.machine.machine_file import load_machine
 
 RIG = load_machine("rig")
@@ -245,7 +246,9 @@ def test_rows_with_the_same_stamp_become_one(tmp_path):
     [
         (np.floor(TIME), "FILE, column 'time', row 1 (line 3): 120 rows share 3 time stamps: the stamps are coarser"
          " than the rows. Log time with more digits"),
-        (-(TIME // 0.1) + TIME % 0.1, "the time stamps go back 23 times"),
+        (-(TIME // 0.1) + TIME % 0.1, "the clock is set back or forward 23 times"),
+        (3e6 * (TIME // 0.1) + TIME % 0.1, "FILE, column 'time', row 5 (line 7): the clock is set back or forward 23"
+         " times"),
         (1e3 * (EPOCH + TIME), "FILE, column 'time', row 1 (line 3): increases by 20 per row: looks like milliseconds"
          " or less, write seconds, or state the unit, as in 'time [ms]'"),
     ],

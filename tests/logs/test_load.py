@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.drive_linkage import axis_linkage
+from hydrotele.logs.clock import estimate_clock_offset, fit_clock
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
-from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.logs.rows import estimate_clock_offset, fit_clock
+from hydrotele.logs.run_files import RunFiles
+from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine import IDEAL_SENSORS, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import default_channel_unit
-from hydrotele.simulate.feedback import simulate_readings
+from hydrotele.simulate.sensor_models import simulate_readings
 from tests.measured import MEASURED, REAL, needs_real
 
 CAT = load_machine("cat215")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.logs.dataset import split_runs
-from hydrotele.logs.rows import RunRows
+from hydrotele.logs.resampling import RunRows
 
 
 def rows(command):

@@ -7,17 +7,12 @@ import pytest
 from scipy import stats
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.machine import (
-    Sensor,
-    find_channel_sensor,
-    get_sensor_set,
-    make_channel_converter,
-    reading_noise_rms,
-)
+from hydrotele.machine.machine import find_channel_sensor, get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.sensors import Sensor, make_channel_converter
 from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.feedback import (
+from hydrotele.simulate.sensor_models import (
     _quantise_readings,
     create_feedback,
     sample_sensor_errors,
@@ -144,7 +139,7 @@ def test_ideal_and_unknown_sensors():
 
 def test_slow_sensors_are_held_for_the_controller():
     """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
-    plant, data, _, seen = prepare_run(load_scenario("zhu_up"))
+    plant, data, _, seen, _ = prepare_run(load_scenario("zhu_up"))
     assert seen.ticks_per_sample == 4 and seen.period == pytest.approx(0.02)
     readings, stepper = [], Stepper(plant, data, 5)
     for tick in range(9):
@@ -159,7 +154,7 @@ def test_slow_sensors_are_held_for_the_controller():
 def test_the_log_shows_what_the_controller_saw():
     """Feedback and log share sampling, errors and converter, clipped pressures included."""
     scenario = load_scenario("steps", {"duration": "3.0"})
-    plant, data, _, seen = prepare_run(scenario)
+    plant, data, _, seen, _ = prepare_run(scenario)
     seen.update(0, Stepper(plant, data, 5))
     log = run_scenario(scenario).measured
     for i, axis in enumerate(plant.axes):

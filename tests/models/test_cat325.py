@@ -9,10 +9,11 @@ from mujoco.batch import Batch
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.kinematics import five_dof
-from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
+from hydrotele.kinematics import feller_arm
+from hydrotele.kinematics.arm_dimensions import arm_geometry, feller_geometry
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import compute_loop_closure_error
+from hydrotele.simulate.closed_loops import compute_loop_closure_error
 from hydrotele.simulate.plant import build_plant, rest_state
 
 CAT = load_machine("cat325")
@@ -89,10 +90,10 @@ def test_closed_form_puts_tip_and_head_where_mujoco_does():
     assert tuple(vars(geometry).values()) == pytest.approx(lengths, abs=1e-12)
     for q, data in random_poses(60):
         mujoco.mj_kinematics(PLANT.model, data)
-        pose, tip = five_dof.forward_kinematics(geometry, q), data.site("hydrotele_tip")
+        pose, tip = feller_arm.forward_kinematics(geometry, q), data.site("hydrotele_tip")
         assert pose[:3] == pytest.approx(tip.xpos, abs=1e-9)
         frame = tip.xmat.reshape(3, 3)
-        assert five_dof.tool_direction(q) == pytest.approx(frame[:, 0], abs=1e-9)
+        assert feller_arm.tool_direction(q) == pytest.approx(frame[:, 0], abs=1e-9)
         # the head's axis leans by the attitude: its z has the cosine for height
         assert frame[2, 2] == pytest.approx(math.cos(pose.attitude), abs=1e-9)
 
@@ -106,7 +107,7 @@ def test_closed_form_jacobian_is_mujocos():
         mujoco.mj_jacSite(model, data, table, None, model.site("hydrotele_tip").id)
         columns = [model.joint(name).dofadr[0] for name in ARM]
         # 1e-9 of metres: as the positions
-        np.testing.assert_allclose(five_dof.jacobian(geometry, q)[:3], table[:, columns], atol=1e-9)
+        np.testing.assert_allclose(feller_arm.jacobian(geometry, q)[:3], table[:, columns], atol=1e-9)
 
 
 def test_home_is_a_felling_posture():

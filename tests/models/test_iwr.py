@@ -5,22 +5,17 @@ import numpy as np
 import pytest
 
 from hydrotele.core.files import models_folder
-from hydrotele.kinematics.hybrid import (
+from hydrotele.kinematics.hybrid_error_model import apply_geometry_errors, build_error_model
+from hydrotele.kinematics.hybrid_robot import (
     PlatformPose,
     UnreachableError,
-    apply_geometry_errors,
-    build_error_model,
     forward_kinematics,
     load_hybrid,
     pose_difference,
 )
-from hydrotele.simulate.closure import compute_loop_closure_error
-from hydrotele.simulate.hybrid import (
-    build_hybrid_mechanism,
-    sample_manufacturing_errors,
-    sample_poses,
-    solve_mechanism_pose,
-)
+from hydrotele.simulate.closed_loops import compute_loop_closure_error
+from hydrotele.simulate.hybrid_mechanism import build_hybrid_mechanism, solve_mechanism_pose
+from hydrotele.simulate.pose_measurements import sample_manufacturing_errors, sample_poses
 
 IWR = load_hybrid("iwr")
 FILE = models_folder() / "iwr" / "iwr.xml"

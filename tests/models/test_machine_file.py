@@ -15,7 +15,7 @@ from hydrotele.core.datafile import read_yaml, split_unit, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.core.units import KEY_SUFFIXES, PSI, si_unit_and_factor
-from hydrotele.kinematics.from_machine import check_strokes
+from hydrotele.kinematics.drive_linkage import check_strokes
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
     find_machine_file,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.files import models_folder
+from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine_file import load_machine, shipped_machines
-from hydrotele.machine.signals import parse_channel
-from hydrotele.simulate.closure import compute_loop_closure_error, holding_forces, independent_dofs, motion_basis
+from hydrotele.simulate.closed_loops import compute_loop_closure_error, holding_forces, independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.measured import REAL, needs_real
 

@@ -6,7 +6,8 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import cardan_angles, load_chain
-from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import make_regressor
 from tests.multibody.test_inverse_dynamics import CRANK
 
 MIDDLE = (0.02, -0.03, 0.8)  # m, of the platform

@@ -7,7 +7,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.multibody import closures
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.closures import find_assemblies, joint_jacobian, solve_joint_positions
+from hydrotele.multibody.closed_chain_kinematics import find_assemblies, joint_jacobian, solve_joint_positions
 
 POSE = tuple(f"platform_{c}" for c in ("x", "y", "z", "rx", "ry", "rz"))
 
@@ -80,6 +80,6 @@ def test_refusals(chain):
 
 def test_a_pendulum_compiles_what_machines_need(chain):
     closures.precompile_loop_residuals()
-    count = len(closures._loop_residuals.signatures)  # one kind of arguments, for all trees
+    count = len(closures.evaluate_loop_residuals.signatures)  # one kind of arguments, for all trees
     closures.close_loops_from(chain.tree, np.array(chain.start), np.arange(3), 1e-9, 1.0)
-    assert len(closures._loop_residuals.signatures) == count == 1
+    assert len(closures.evaluate_loop_residuals.signatures) == count == 1

@@ -7,17 +7,9 @@ import pytest
 
 from hydrotele.estimate.reduced_model import place
 from hydrotele.multibody.inverse_dynamics import project_on_drives
-from hydrotele.multibody.reduced_mechanism import (
-    BIAS,
-    DRIFT,
-    INERTIA,
-    MASS,
-    RATE,
-    Q,
-    compute_mass_and_bias,
-    coordinate_names,
-)
-from hydrotele.simulate.closure import independent_dofs, load_closed_chain, motion_basis
+from hydrotele.multibody.reduced_dynamics import BIAS, DRIFT, RATE, Q, compute_mass_and_bias
+from hydrotele.multibody.reduced_mechanism import INERTIA, MASS, coordinate_names
+from hydrotele.simulate.closed_loops import independent_dofs, load_closed_chain, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "cat325", "ec20", "rig", "emps")
@@ -34,7 +26,7 @@ def reduced_forces(model, space, z):
 
 
 def mujoco_forces(machine, model, z):
-    """The same from MuJoCo's open tree, with the closures' basis of `simulate.closure`."""
+    """The same from MuJoCo's open tree, with the closures' basis of `simulate.closed_loops`."""
     plant, names = build_plant(machine, ground=False), coordinate_names(machine)
     free = [names[i] for i in model.mech.independent]
     n, own = len(free), plant.model

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from hydrotele.estimate.reduced_model import place
-from hydrotele.multibody.reduced_mechanism import (
+from hydrotele.multibody.reduced_dynamics import (
     ACCELERATION,
-    COORDINATE_END,
     DRIFT,
-    JOINT,
     LENGTH,
     LENGTH_BIAS,
     LENGTH_RATE,
@@ -21,6 +19,7 @@ from hydrotele.multibody.reduced_mechanism import (
     VELOCITY,
     Q,
 )
+from hydrotele.multibody.reduced_mechanism import COORDINATE_END, JOINT
 
 MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "ec20", "rig", "emps")
 STEP = 1e-5  # [s]: truncation 1e-10 of the third derivative, cancellation 1e-11 of the value

@@ -9,18 +9,14 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import with_value
 from hydrotele.hydraulics.laws import friction_force
-from hydrotele.identify.estimation import estimate_linear_parameters
 from hydrotele.identify.identifiability import classify_parameters, reference_sizes
-from hydrotele.identify.setup import drive_friction_terms, machine_setup
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters
+from hydrotele.identify.regressor_setup import drive_friction_terms, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import (
-    FrictionTerm,
-    make_regressor,
-    passive_friction_terms,
-    project_on_drives,
-)
-from hydrotele.simulate.closure import independent_dofs, motion_basis
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import FrictionTerm, make_regressor, passive_friction_terms
+from hydrotele.simulate.closed_loops import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 POSES = {

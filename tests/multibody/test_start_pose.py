@@ -5,7 +5,8 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.closures import find_undetermined_joints, solve_joint_positions
+from hydrotele.multibody.closed_chain_kinematics import solve_joint_positions
+from hydrotele.multibody.closures import find_undetermined_joints
 
 FOUR_BAR = """<mujoco model="fourbar"><compiler angle="radian"/><worldbody>
   <body name="crank"><joint name="crank" axis="0 1 0"/><geom size="0.01"/>

@@ -32,9 +32,9 @@ def rows_of(folder: Path) -> list[dict]:
 @pytest.fixture(scope="session")
 def done(tmp_path_factory) -> Path:
     """The folder of the tiny sweep, done once without interruption, with logs."""
-    from hydrotele.cli.running import write_run
+    from hydrotele.cli.run_command import write_run
     from hydrotele.run.sweep import SweepSettings, run_sweep
-    from hydrotele.run.sweep_facts import load_sweep
+    from hydrotele.run.sweep_file import load_sweep
 
     folder = tmp_path_factory.mktemp("sweep")
     file = load_sweep(write_sweep(folder, logs=True))

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from hydrotele.cli.driving import DriveOptions, drive_to_folder
+from hydrotele.cli.drive_command import DriveOptions, drive_to_folder
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.server import DEFAULT_PORT
 from hydrotele.logs.log import load_log
-from hydrotele.run.live import parse_haptic_address
+from hydrotele.run.interactive_run import parse_haptic_address
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 

@@ -20,7 +20,7 @@ from hydrotele.run.run import (
     start_session,
 )
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario
-from hydrotele.simulate.audit import compute_balance_errors, full_physics_state
+from hydrotele.simulate.conservation_checks import compute_balance_errors, full_physics_state
 from hydrotele.simulate.record import SimulationFailed, start_leapfrog
 
 DATA = Path(__file__).parents[1] / "data"
@@ -316,7 +316,7 @@ def test_failed_simulation_tells_its_last_states():
     axes = {"slide": axis.model_copy(update={"force": force})}
     wild = machine.model_copy(update={"axes": axes})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hydrotele.run.run.load_simulated_machine", lambda _: wild)
+        patch.setattr("hydrotele.run.run.add_scenario_effects", lambda *_: wild)
         with pytest.raises(SimulationFailed, match=r"(?s)unstable at 0\.\d+ s.*qpos=") as failure:
             run_scenario(scenario)
     assert "t=0." in str(failure.value)

@@ -16,27 +16,13 @@ from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import save_log
-from hydrotele.run import sweep_runs as running
+from hydrotele.run import sweep_task as running
 from hydrotele.run.run import run_scenario
 from hydrotele.run.sweep import SweepSettings, open_sweep_folder, run_in_processes, run_sweep
-from hydrotele.run.sweep_facts import (
-    check_points,
-    iterate_points,
-    load_sweep,
-    make_point_scenario,
-    point_overrides,
-    read_base_scenario,
-)
-from hydrotele.run.sweep_runs import (
-    FAILED,
-    OK,
-    Journal,
-    JournalEntry,
-    RunTask,
-    execute_task,
-    flatten_summary,
-    possible_number_names,
-)
+from hydrotele.run.sweep_file import iterate_points, load_sweep, point_overrides
+from hydrotele.run.sweep_journal import FAILED, OK, Journal, JournalEntry
+from hydrotele.run.sweep_scenarios import check_points, make_point_scenario, read_base_scenario
+from hydrotele.run.sweep_task import RunTask, execute_task, flatten_summary, possible_number_names
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
 from tests.run.conftest import rows_of, write_sweep

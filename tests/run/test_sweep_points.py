@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.run.sweep_facts import Sweep, draw_samples, iterate_points, point_overrides
+from hydrotele.run.sweep_file import Sweep, draw_samples, iterate_points, point_overrides
 
 KEYS = {
     "servo.lead": {"uniform": [0.0, 0.2]},

@@ -14,7 +14,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.run import sweep as cluster
 from hydrotele.run.sweep import SweepSettings, run_sweep
-from hydrotele.run.sweep_facts import load_sweep
+from hydrotele.run.sweep_file import load_sweep
 from tests.run.conftest import rows_of, write_sweep
 
 ROOT = Path(hydrotele.__file__).parents[1]

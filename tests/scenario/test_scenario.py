@@ -16,7 +16,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import finish_run, prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, shipped_scenarios
-from hydrotele.simulate.closure import compute_loop_closure_error
+from hydrotele.simulate.closed_loops import compute_loop_closure_error
 from hydrotele.simulate.record import SimulationFailed
 
 DATA = Path(__file__).parents[1] / "data"

@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import MEASURED_KINDS, TRUTH_KINDS
+from hydrotele.machine.log_channels import MEASURED_KINDS, TRUTH_KINDS
 from hydrotele.show.channels import (
     TITLES,
     assign_axis_colours,

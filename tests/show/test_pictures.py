@@ -9,11 +9,11 @@ from matplotlib.text import Text
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.show.overlay import _png_figure, plot_log, plot_overlay
-from hydrotele.show.picture import render_machine
+from hydrotele.show.log_plots import _png_figure, plot_log, plot_overlay
+from hydrotele.show.machine_image import render_machine
 from hydrotele.show.recording import write_recording
 from hydrotele.show.report_html import figure_to_png, open_report_figure, svg
-from hydrotele.show.viewer import serve_web_viewer, take_screenshot
+from hydrotele.show.rerun_viewer import serve_web_viewer, take_screenshot
 
 
 def _pixels(path) -> np.ndarray:

@@ -10,8 +10,9 @@ import pytest
 import rerun as rr
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion
-from hydrotele.show.recording import open_recording, write_recording
+from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion
+from hydrotele.show.recording import write_recording
+from hydrotele.show.rerun_stream import open_recording
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +138,7 @@ def test_importing_the_room_does_not_import_rerun():
     import sys
 
     code = (
-        "import sys, hydrotele.show.recording, hydrotele.show.overlay, hydrotele.show.viewer;"
+        "import sys, hydrotele.show.recording, hydrotele.show.log_plots, hydrotele.show.rerun_viewer;"
         "assert not {'rerun', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.show import looks as shapes
-from hydrotele.show.looks import body_meshes, geom_colour
+from hydrotele.show import meshes as shapes
+from hydrotele.show.visual_geometry import body_meshes, geom_colour
 
 _BODIES = {
     "box": (shapes.make_box_mesh((0.5, 1.0, 1.5)), 6.0),

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from hydrotele.effects.effect import with_value
-from hydrotele.kinematics.from_machine import axis_linkage, has_ball_ends
+from hydrotele.kinematics.drive_linkage import axis_linkage, has_ball_ends
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.reduced_mechanism import make_reduced_mechanism
-from hydrotele.simulate.closure import close_loops, compute_loop_closure_error, holding_forces
+from hydrotele.simulate.closed_loops import close_loops, compute_loop_closure_error, holding_forces
 from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document, tilt_joint_name
 
 TILT = np.radians(1.0)

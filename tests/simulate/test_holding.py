@@ -6,14 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.simulate.surroundings import (
-    RELEASED,
-    TAKEN,
-    UNCHANGED,
-    WELD_SIZE,
-    grip_parameters,
-    grip_step,
-)
+from hydrotele.simulate.gripping import RELEASED, TAKEN, UNCHANGED, WELD_SIZE, grip_parameters, grip_step
 
 CENTRE, HALF = (0.7, 0.0, 0.1), (0.1, 0.3, 0.2)
 GRIP = grip_parameters(1.2, 1.0, 1, math.radians(20.0), CENTRE, HALF, 0, (-1.5, 1.5))

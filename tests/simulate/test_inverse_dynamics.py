@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hydrotele.simulate.closure import independent_dofs, motion_basis
+from hydrotele.simulate.closed_loops import independent_dofs, motion_basis
 from hydrotele.simulate.plant import rest_state
 
 POSES = {

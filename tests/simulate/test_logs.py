@@ -7,10 +7,11 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import prepare_run, run_scenario, start_session
-from hydrotele.scenario.scenario import LogOnGround, Scenario, load_scenario
-from hydrotele.show.pose import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
+from hydrotele.scenario.scenario import Scenario, load_scenario
+from hydrotele.scenario.surrounding_objects import LogOnGround
+from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
+from hydrotele.simulate.gripping import POCKET_CENTRE, POCKET_HALF_SIZE, timber_log_grip_parameters
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.surroundings import POCKET_CENTRE, POCKET_HALF_SIZE, timber_log_grip_parameters
 
 END = np.array([6.03 * np.cos(np.pi / 3), 6.03 * np.sin(np.pi / 3)])  # slewed by 60 deg
 

@@ -8,7 +8,7 @@ import pytest
 from mujoco.batch import Batch
 
 from hydrotele.hydraulics.circuit import ActuatorKind, Slot
-from hydrotele.simulate.closure import compute_loop_closure_error, independent_dofs, motion_basis
+from hydrotele.simulate.closed_loops import compute_loop_closure_error, independent_dofs, motion_basis
 from hydrotele.simulate.plant import REST_PRESSURE, rest_state
 
 IN2 = 6.4516e-4

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 
 from hydrotele.hydraulics.circuit import Slot
-from hydrotele.simulate.closure import independent_dofs, motion_basis
+from hydrotele.simulate.closed_loops import independent_dofs, motion_basis
 from hydrotele.simulate.plant import rest_state
 
 SWING, BOOM, STICK = range(3)

@@ -7,7 +7,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.run.run import prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.record import mark_surrounding_bodies, total_contact_force
+from hydrotele.simulate.contact_forces import mark_surrounding_bodies, total_contact_force
 
 PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}
 TREE = {"kind": "tree", "position": [8.0, 0.0]}

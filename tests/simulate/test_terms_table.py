@@ -5,7 +5,7 @@ import numpy as np
 
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant
-from hydrotele.terms.law import Term
+from hydrotele.terms.term import Term
 
 
 def moved(*forces: float) -> np.ndarray:

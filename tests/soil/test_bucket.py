@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.soil.facts import (
+from hydrotele.soil.parameters import (
     CAT215,
     SOILS,
     make_level_profile,

@@ -16,7 +16,7 @@ from hydrotele.soil import step, terrain
 from hydrotele.soil import step as bucket
 from hydrotele.soil import step as cutting
 from hydrotele.soil import step as wrench
-from hydrotele.soil.facts import CAT215, SOILS, Soil, pack_soil_parameters
+from hydrotele.soil.parameters import CAT215, SOILS, Soil, pack_soil_parameters
 from hydrotele.soil.step import (
     adhesion_factor,
     bearing_pressure,

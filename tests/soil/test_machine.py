@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.kinematics.from_machine import arm_geometry
-from hydrotele.kinematics.task import arm_parameters, compute_tip_pose, solve_joint_angles, task_jacobian
+from hydrotele.kinematics.arm_dimensions import arm_geometry
+from hydrotele.kinematics.task_space import arm_parameters, compute_tip_pose, solve_joint_angles, task_jacobian
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.soil.facts import (
+from hydrotele.soil.parameters import (
     CARRIED_VOLUME,
     CAT215,
     FORCE_R,

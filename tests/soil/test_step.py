@@ -14,7 +14,7 @@ from numba import (
 )
 
 from hydrotele.core.compiled import callback
-from hydrotele.soil.facts import (
+from hydrotele.soil.parameters import (
     CARRIED_VOLUME,
     CAT215,
     CELL_LENGTH,

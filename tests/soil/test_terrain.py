@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hydrotele.soil.facts import (
+from hydrotele.soil.parameters import (
     CAT215,
     CELL_LENGTH,
     PROFILE_START,

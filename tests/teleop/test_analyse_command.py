@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import DEFAULT_CASE_FILE, load_teleop_case
+from hydrotele.teleop.case_file import DEFAULT_CASE_FILE, load_teleop_case
 from hydrotele.teleop.two_port import STRUCTURES
 
 SMALL = "map: {points: 3}\n"  # nine cells

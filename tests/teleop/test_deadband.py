@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.teleop.findings import deadband_gain
+from hydrotele.teleop.scenario_analysis import deadband_gain
 
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 0.9])

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
-from hydrotele.cli.analysing import analyse_scenario
+from hydrotele.cli.analyse_command import analyse_scenario
 from hydrotele.core.errors import InputError
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

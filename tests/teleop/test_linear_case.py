@@ -11,7 +11,6 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.teleop.findings import analyse_scenario_case, analyse_scenario_loop
 from hydrotele.teleop.linear_case import (
     DEFAULT_TASK,
     build_scenario_case,
@@ -19,6 +18,7 @@ from hydrotele.teleop.linear_case import (
     tip_controller_impedance,
     tip_tracking_response,
 )
+from hydrotele.teleop.scenario_analysis import analyse_scenario_case, analyse_scenario_loop
 from hydrotele.teleop.two_port import Impedance
 
 SLOW = 1e-4j  # rad/s, far below every corner

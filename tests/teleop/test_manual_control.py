@@ -9,6 +9,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import find_principal_values, load_joystick
 from hydrotele.scenario.teleoperation import OperatorSettings, TeleopPilot
+from hydrotele.teleop.hand_impedance import arm_impedance, attach_operator_hand
 from hydrotele.teleop.manual_control import (
     DOUBLE_INTEGRATOR,
     ESTIMATED_GAIN,
@@ -25,13 +26,7 @@ from hydrotele.teleop.manual_control import (
     simulate_tracking,
 )
 from hydrotele.teleop.operator_model import read_recorded_hand
-from hydrotele.teleop.operator_parameters import (
-    arm_impedance,
-    attach_operator_hand,
-    load_operator_file,
-    make_operator,
-    make_scenario_operator,
-)
+from hydrotele.teleop.operator_parameters import load_operator_file, make_operator, make_scenario_operator
 
 HIM = make_operator(load_operator_file(), None)
 TIME = np.arange(0.0, 150.0, 0.01)

@@ -5,11 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hydrotele.core.contiguous_state import flat_view
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
-from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, build_axis_table, flat_view
+from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, build_axis_table
 from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.master import (
     build_master,

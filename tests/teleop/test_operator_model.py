@@ -7,7 +7,8 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import HANDLE_RANGE, NOMINAL_STIFFNESS
 from hydrotele.teleop.master import build_master
-from hydrotele.teleop.operator_model import OperatorModel, compute_muscle_forces
+from hydrotele.teleop.neuromuscular_dynamics import compute_muscle_forces
+from hydrotele.teleop.operator_model import OperatorModel
 
 STICK, PERIOD, TICKS = load_joystick(), 0.005, 400
 CARRIED = 9.81 * STICK.hand.mass

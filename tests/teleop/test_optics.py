@@ -8,13 +8,8 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import quaternion_to_matrix, relative_quaternion
-from hydrotele.teleop.levitation import (
-    diode_readings,
-    pose_resolution,
-    quaternion_to_rotation_vector,
-    rotation_vector_to_quaternion,
-    solve_flotor_pose,
-)
+from hydrotele.teleop.levitation import quaternion_to_rotation_vector, rotation_vector_to_quaternion
+from hydrotele.teleop.optical_sensing import diode_readings, pose_resolution, solve_flotor_pose
 
 JOYSTICK = load_joystick()
 FAR, STEP = JOYSTICK.diodes.distance, JOYSTICK.diodes.step

@@ -9,7 +9,7 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.teleop.axis_table import DAMPING, NOMINAL_STIFFNESS
 from hydrotele.teleop.master import build_master, step_master
-from hydrotele.teleop.sampled import (
+from hydrotele.teleop.sampled_stability import (
     HandleBody,
     make_spinning_body,
     make_tilting_body,

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.resolved_motion import arm_specification, pose_to_joints
+from hydrotele.control.arm_kinematics import arm_specification, pose_to_joints
+from hydrotele.core.contiguous_state import flat_view
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.scenario.scenario import Pose
+from hydrotele.scenario.pilots import Pose
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.axis_table import flat_view
 from hydrotele.teleop.master import build_master
 from hydrotele.teleop.slave import (
     HELD_AT_EDGE,

@@ -6,22 +6,16 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import TeleoperatorAxis
-from hydrotele.teleop.time_simulation import (
-    compare_stability,
-    is_growing,
-    measure_sine_impedance,
-    simulate_impulse_response,
-)
+from hydrotele.teleop.case_file import TeleoperatorAxis
+from hydrotele.teleop.nyquist_criterion import count_unstable_poles, count_unstable_poles_held, is_stable
+from hydrotele.teleop.simulation_check import compare_stability
+from hydrotele.teleop.time_simulation import is_growing, measure_sine_impedance, simulate_impulse_response
 from hydrotele.teleop.two_port import (
     STRUCTURES,
     Impedance,
     StructureGains,
     characteristic_function,
-    count_unstable_poles,
-    count_unstable_poles_held,
     hybrid_matrix,
-    is_stable,
     make_two_port,
     scattering_norm,
     stability_theorem_margin,

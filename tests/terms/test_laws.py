@@ -10,17 +10,8 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine, Supply
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms import law as laws
-from hydrotele.terms.law import (
-    LAWS,
-    NO_DRIVES,
-    VARIABLES,
-    Drives,
-    DriveState,
-    Play,
-    Term,
-    encode_formula,
-    law,
-)
+from hydrotele.terms.drive_state import NO_DRIVES, VARIABLES, Drives, DriveState
+from hydrotele.terms.law import LAWS, encode_formula, law
 from hydrotele.terms.table import (
     ANY_DRIVE,
     COMMAND,
@@ -36,6 +27,7 @@ from hydrotele.terms.table import (
     sum_terms_with_slope,
     update_term_state,
 )
+from hydrotele.terms.term import Play, Term
 
 STATE = DriveState(
     time=1.7, position=0.43, velocity=-0.21, spool=0.3, spool_rate=-2.0, pressure_head=9.0e6,

@@ -15,7 +15,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 import hydrotele.envs
-from hydrotele.envs.core import TaskCore
+from hydrotele.envs.episode_batch import TaskCore
 from tools.studies.study import options, publish
 
 RATES = (1000.0, 200.0, 50.0)  # Hz: 1, 5 and 20 physics steps per environment step

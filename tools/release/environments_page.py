@@ -3,11 +3,11 @@
 python tools/release/environments_page.py --out docs/environments.md
 """
 
-from hydrotele.envs.core import make_task_setup
 from hydrotele.envs.episode import ACTIONS
-from hydrotele.envs.facts import TaskSetup
-from hydrotele.envs.making import TASKS
+from hydrotele.envs.episode_batch import make_task_setup
 from hydrotele.envs.task import Options, Task
+from hydrotele.envs.task_catalogue import TASKS
+from hydrotele.envs.task_setup import TaskSetup
 from tools.studies.study import options, publish
 
 COMMON = """\

@@ -17,13 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import make_regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.study import options, publish
 
 CHILD = """

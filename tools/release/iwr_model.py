@@ -9,14 +9,14 @@ import matplotlib.image
 import mujoco
 import numpy as np
 
-from hydrotele.kinematics.hybrid import (
+from hydrotele.kinematics.hybrid_robot import (
     PlatformPose,
     euler_to_rotation,
     home_pose,
     leg_readings,
     load_hybrid,
 )
-from hydrotele.simulate.hybrid import build_hybrid_mechanism, solve_mechanism_pose
+from hydrotele.simulate.hybrid_mechanism import build_hybrid_mechanism, solve_mechanism_pose
 
 FOLDER = Path(__file__).resolve().parents[2] / "models" / "iwr"
 JOINTS = np.array([0.9, 0.05, -0.35, 0.12])  # m and rad, of the picture

@@ -15,11 +15,12 @@ import time
 
 import numpy as np
 
-from hydrotele.calibrate.arm import identify_arm, identify_jointly, update_machine_geometry
+from hydrotele.calibrate.arm_identification import identify_arm, identify_jointly
 from hydrotele.calibrate.arm_poses import add_held_link_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
-from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, generate_sweep_poses
-from hydrotele.calibrate.loop import build_loop, unit_of
+from hydrotele.calibrate.calibration_loop import build_loop, unit_of
+from hydrotele.calibrate.link_sweeps import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, generate_sweep_poses
+from hydrotele.calibrate.machine_correction import update_machine_geometry
 from hydrotele.experiments.calibrator_readings import (
     compute_tip_errors,
     find_true_parameters,

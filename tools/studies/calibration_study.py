@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.calibrate.mukca import SocketOptions, calibrate_sockets, evaluate_robot
-from hydrotele.calibrate.sockets import RobotErrors, add_random_errors, simulate_sockets
+from hydrotele.calibrate.socket_calibration import SocketOptions, calibrate_sockets, evaluate_robot
+from hydrotele.calibrate.socket_measurement import RobotErrors, add_random_errors, simulate_sockets
 from hydrotele.identify.identifiability import STATUS_COMBINATION, STATUS_FULL
-from hydrotele.kinematics.serial_robot import load_robot
+from hydrotele.kinematics.serial_robot_files import load_robot
 
 PLACES = {
     "left": (0.45, 0.25, 0.05), "right": (0.45, -0.30, 0.05), "front": (0.60, 0.0, 0.05),

@@ -11,8 +11,9 @@ import numpy as np
 
 from hydrotele.effects.effect import with_value
 from hydrotele.logs.log import Log, load_log
-from hydrotele.machine.machine import Machine, SensorError
+from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.sensors import SensorError
 
 LOADS = {1: "none", 2: "load_20_bar", 3: "load_30_bar", 4: "load_40_bar", 5: "load_50_bar"}
 CHANNELS = ("position.piston", "pressure_head.piston", "pressure_rod.piston")

@@ -17,11 +17,9 @@ from hydrotele.control.endpoint_force import (
     FORCE_BANDWIDTH_HZ,
     MOTION_BANDWIDTH_HZ,
     EndpointForce,
-    GravityModel,
     endpoint_force_of_log,
-    fit_gravity_to_masses,
-    identify_gravity,
 )
+from hydrotele.control.gravity_model import GravityModel, fit_gravity_to_masses, identify_gravity
 from hydrotele.control.state_filter import VALUE, filter_delay, filter_signal, filter_step_matrix
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine

@@ -12,11 +12,11 @@ from hydrotele.envs.controllers.catalogue import (
     REFERENCE_CONTROLLERS,
     make_controller,
 )
-from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate_controller
-from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import REAL_SENSORS, Options
+from hydrotele.envs.task_catalogue import TASKS
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from tools.studies.study import options, publish

@@ -24,14 +24,14 @@ from hydrotele.identify.excitation import (
 )
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import build_records, compute_force_noise
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.identify.result import parameter_rows
-from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.study import options, publish
 
 SENSORS, OLD, HELD_OUT = "khoshzaban1992", "excitation", "excitation_fast"

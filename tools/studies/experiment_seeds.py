@@ -13,7 +13,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from hydrotele.cli.experimenting import write_comparison_files
+from hydrotele.cli.experiments_command import write_comparison_files
 from hydrotele.experiments.comparison import Series, compare_by_repetition_count
 
 

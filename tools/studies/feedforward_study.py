@@ -19,17 +19,17 @@ from hydrotele.effects.effect import with_value
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.identified_machine import build_identified_machine
 from hydrotele.identify.record import build_records
-from hydrotele.identify.setup import machine_setup
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.kinematics.arm import forward_kinematics_cartesian, inverse_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.kinematics.arm_dimensions import arm_geometry
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.drives import Axis, ForceDrive, Friction
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.study import options, publish
 
 SENSORS = "khoshzaban1992"

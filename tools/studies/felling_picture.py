@@ -14,7 +14,7 @@ from PIL import Image
 
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.show.pose import (
+from hydrotele.show.logged_poses import (
     compile_visual_model,
     compute_joint_positions,
     extract_joint_motion,

@@ -8,29 +8,24 @@ import time
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import (
+from hydrotele.calibrate.hybrid_calibration import (
     PoseEquations,
     build_equations,
     calibrate_hybrid_robot,
     restrict_to_fitted_parameters,
     select_informative_poses,
 )
-from hydrotele.calibrate.hybrid_data import measurement_from_wires
-from hydrotele.calibrate.posterior import sample_posterior
+from hydrotele.calibrate.hybrid_measurement import measurement_from_wires
+from hydrotele.calibrate.posterior_sampling import sample_posterior
 from hydrotele.experiments.wang_robots import (
     SENSOR_NOISE,
     compute_test_pose_errors,
     simulate_robot,
 )
-from hydrotele.kinematics.hybrid import (
-    apply_geometry_errors,
-    build_error_model,
-    forward_kinematics,
-    load_hybrid,
-    refined_model_parameters,
-)
-from hydrotele.kinematics.wires import wire_lengths
-from hydrotele.simulate.hybrid import (
+from hydrotele.kinematics.hybrid_error_model import apply_geometry_errors, build_error_model, refined_model_parameters
+from hydrotele.kinematics.hybrid_robot import forward_kinematics, load_hybrid
+from hydrotele.kinematics.wire_measurement import wire_lengths
+from hydrotele.simulate.pose_measurements import (
     default_wires,
     sample_manufacturing_errors,
     sample_poses,

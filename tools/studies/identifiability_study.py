@@ -8,7 +8,7 @@ cylinders end in pins, or in ball joints that carry no moment about the cylinder
 """
 
 from hydrotele.experiments.khoshzaban_dynamics import TABLE_13, count_identifiability_classes
-from hydrotele.experiments.khoshzaban_models import find_base_parameters
+from hydrotele.experiments.khoshzaban_regressors import find_base_parameters
 from tools.studies.study import options, publish
 
 ENDS = (("ball joints (Eq. 4.23)", True), ("pins", False))

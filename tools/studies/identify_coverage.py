@@ -18,13 +18,13 @@ from scipy.stats import chi2
 
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import build_records
-from hydrotele.identify.setup import RegressorSetup, machine_setup
+from hydrotele.identify.regressor_setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.study import options, publish, side_by_side
 
 FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

@@ -17,15 +17,15 @@ import numpy as np
 
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.record import IdentificationRecord, build_records
+from hydrotele.identify.regressor_setup import machine_setup
 from hydrotele.identify.result import Identification
-from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset, make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.identify_coverage import wrong_setup
 from tools.studies.study import options, publish, side_by_side
 

@@ -14,16 +14,16 @@ import mujoco
 import numpy as np
 
 from hydrotele.identify.identification import identify_with_friction_shapes
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
 from hydrotele.identify.record import IdentificationRecord, build_records
+from hydrotele.identify.regressor_setup import RegressorSetup, machine_setup
 from hydrotele.identify.result import Identification, parameter_rows
-from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import Chain, load_chain
-from hydrotele.multibody.inverse_dynamics import FrictionTerm
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.multibody.regressor import FrictionTerm
+from hydrotele.simulate.closed_loops import load_closed_chain
 
 HELD_OUT = 0.25
 WIDE = 10.0  # Hz: the whole of what is in the Panda's torques besides noise

@@ -16,19 +16,20 @@ import numpy as np
 
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.motion import Processing
+from hydrotele.identify.joint_motion import Processing
 from hydrotele.identify.record import build_records
-from hydrotele.identify.setup import RegressorSetup, machine_setup
+from hydrotele.identify.regressor_setup import RegressorSetup, machine_setup
 from hydrotele.kinematics.arm import inverse_kinematics
-from hydrotele.kinematics.from_machine import arm_geometry
+from hydrotele.kinematics.arm_dimensions import arm_geometry
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import make_regressor
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.identify_coverage import wrong_setup
 from tools.studies.study import options, publish, side_by_side
 

@@ -17,18 +17,18 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor, coil_force_factors
 from hydrotele.teleop.coils import make_three_station_coils, relative_heating, time_to_overheat
 from hydrotele.teleop.compliance import Flotor, quaternion_to_matrix
-from hydrotele.teleop.flotor import FlotorFit, identify_flotor_parameters
+from hydrotele.teleop.flotor_identification import FlotorFit, identify_flotor_parameters
 from hydrotele.teleop.levitation import (
     LevitationRun,
     make_excitation_path,
     make_levitation_control,
-    pose_resolution,
     quaternion_to_rotation_vector,
     second_order_step_response,
     simulate_levitation,
 )
 from hydrotele.teleop.master import build_master, step_master
-from hydrotele.teleop.sampled import (
+from hydrotele.teleop.optical_sensing import pose_resolution
+from hydrotele.teleop.sampled_stability import (
     make_spinning_body,
     make_tilting_body,
     max_sampled_handle_eigenvalue,

@@ -18,14 +18,14 @@ import numpy as np
 
 from hydrotele.envs.controllers.catalogue import make_controller, tune_gains
 from hydrotele.envs.controllers.controller import Controller
-from hydrotele.envs.controllers.track import TrackByValves
-from hydrotele.envs.core import TaskCore, make_task_setup
+from hydrotele.envs.controllers.tracking import TrackByValves
 from hydrotele.envs.episode import DISABLED
+from hydrotele.envs.episode_batch import TaskCore, make_task_setup
 from hydrotele.envs.evaluation import Scores, evaluate_controller, tabulate_scores
-from hydrotele.envs.facts import TaskSetup
-from hydrotele.envs.making import TASKS
 from hydrotele.envs.stable_baselines import AgentInterface
 from hydrotele.envs.task import Options
+from hydrotele.envs.task_catalogue import TASKS
+from hydrotele.envs.task_setup import TaskSetup
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo

@@ -16,6 +16,7 @@ from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.scenario.teleoperation import OperatorSettings
+from hydrotele.teleop.hand_impedance import attach_operator_hand
 from hydrotele.teleop.manual_control import (
     FORMS,
     TrackingRecord,
@@ -25,11 +26,7 @@ from hydrotele.teleop.manual_control import (
     simulate_tracking,
 )
 from hydrotele.teleop.operator_identification import identify_operator
-from hydrotele.teleop.operator_parameters import (
-    attach_operator_hand,
-    load_operator_file,
-    make_operator,
-)
+from hydrotele.teleop.operator_parameters import load_operator_file, make_operator
 from hydrotele.teleop.psychophysics import measure_discrimination
 from tools.studies.study import options, publish
 

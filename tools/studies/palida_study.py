@@ -26,7 +26,7 @@ from hydrotele.experiments.palida import (
     make_drive_limits,
 )
 from hydrotele.identify.excitation import design_motion
-from hydrotele.multibody.closures import find_assemblies, joint_jacobian, solve_joint_positions
+from hydrotele.multibody.closed_chain_kinematics import find_assemblies, joint_jacobian, solve_joint_positions
 from tools.studies.study import options, publish
 
 RADIUS = 0.085  # m, at which rotations count

@@ -16,19 +16,20 @@ from dataclasses import replace
 import numpy as np
 
 from hydrotele.identify.equations import build_equations, concatenate_over_runs
-from hydrotele.identify.estimation import estimate_linear_parameters
 from hydrotele.identify.identifiability import classify_parameters, reference_sizes
-from hydrotele.identify.motion import Processing, estimate_resolution
+from hydrotele.identify.joint_motion import Processing, estimate_resolution
+from hydrotele.identify.linear_least_squares import estimate_linear_parameters
 from hydrotele.identify.record import IdentificationRecord, build_records
-from hydrotele.identify.setup import RegressorSetup, machine_setup
+from hydrotele.identify.regressor_setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
-from hydrotele.logs.files import RunFiles
+from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.multibody.regressor import make_regressor
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import load_closed_chain
+from hydrotele.simulate.closed_loops import load_closed_chain
 from tools.studies.study import options, publish, side_by_side
 
 RUNS, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"

@@ -10,17 +10,17 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.teleop.analysis import TeleoperatorAxis, load_teleop_case
-from hydrotele.teleop.robust import case_impedance_ranges, evaluate_robustness
-from hydrotele.teleop.sampled import (
+from hydrotele.teleop.case_file import TeleoperatorAxis, load_teleop_case
+from hydrotele.teleop.robustness import case_impedance_ranges, evaluate_robustness
+from hydrotele.teleop.sampled_simulation import simulate_initial_velocities
+from hydrotele.teleop.sampled_stability import (
     SAMPLED_STRUCTURES,
     PacketAges,
     constant_delay_ages,
     measured_delay_ages,
     predict_stability,
 )
-from hydrotele.teleop.sampled_run import simulate_initial_velocities
-from hydrotele.teleop.switching import StiffnessAxis
+from hydrotele.teleop.stiffness_switching import StiffnessAxis
 from hydrotele.teleop.two_port import STRUCTURES, Impedance, StructureGains
 from tools.studies.study import options, publish, side_by_side
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.cli.analysing import analyse_scenario
+from hydrotele.cli.analyse_command import analyse_scenario
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from tools.studies.study import options, publish, side_by_side

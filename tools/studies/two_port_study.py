@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.teleop.analysis import TeleoperatorAxis, load_teleop_case
-from hydrotele.teleop.time_simulation import compare_stability, run_sine_sweep
+from hydrotele.teleop.case_file import TeleoperatorAxis, load_teleop_case
+from hydrotele.teleop.simulation_check import compare_stability, run_sine_sweep
 from hydrotele.teleop.two_port import STRUCTURES, Impedance, StructureGains
 from tools.studies.study import options, publish, side_by_side
 

@@ -37,7 +37,7 @@ import yaml
 
 from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.teleop.analysis import DEFAULT_CASE_FILE
+from hydrotele.teleop.case_file import DEFAULT_CASE_FILE
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
 _FINE = (0, 2, 3)  # done, the user's mistake, a simulation that left the finite numbers

@@ -15,7 +15,8 @@ import numpy as np
 
 from hydrotele.envs import TASK_NAMES
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.dataset import load_dataset, select_exciting_segments
+from hydrotele.logs.dataset import load_dataset
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario

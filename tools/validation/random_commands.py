@@ -12,11 +12,11 @@ import numpy as np
 from mujoco.batch import Batch
 
 from hydrotele.core.errors import InputError
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import dependent_joints
+from hydrotele.simulate.closed_loops import dependent_joints
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
 

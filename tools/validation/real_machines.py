@@ -23,11 +23,12 @@ from hydrotele.estimate.free_run import Prepare, free_run_errors, machine_runner
 from hydrotele.estimate.output_error import fit_free_runs, uncertain_parameters
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.identify.smoothing import filter_zero_phase
-from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment, load_dataset
+from hydrotele.identify.zero_phase_filter import filter_zero_phase
+from hydrotele.logs.dataset import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset_reduction import find_exciting_segment
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.terms.law import NO_DRIVES, DriveState
+from hydrotele.terms.drive_state import NO_DRIVES, DriveState
 from hydrotele.terms.table import FORCE, encode_terms_table, sum_terms
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none

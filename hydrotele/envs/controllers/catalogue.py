@@ -6,14 +6,14 @@ from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller, RandomController, ZeroController
 from hydrotele.envs.controllers.grade import make_grade_controller
-from hydrotele.envs.controllers.place import make_place_controller
-from hydrotele.envs.controllers.track import (
+from hydrotele.envs.controllers.place_log import make_place_controller
+from hydrotele.envs.controllers.tracking import (
     make_line_controller,
     make_press_controller,
     make_reach_controller,
     make_track_controller,
 )
-from hydrotele.envs.facts import TaskSetup
+from hydrotele.envs.task_setup import TaskSetup
 
 REFERENCE_CONTROLLERS: dict[str, Callable[[TaskSetup], Controller]] = {
     "TrackTrajectory": make_track_controller,

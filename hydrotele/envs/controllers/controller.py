@@ -23,8 +23,8 @@ from hydrotele.control.servo import (
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.facts import TaskSetup
-from hydrotele.kinematics.task import compute_tip_pose, solve_joint_angles
+from hydrotele.envs.task_setup import TaskSetup
+from hydrotele.kinematics.task_space import compute_tip_pose, solve_joint_angles
 from hydrotele.scenario.scenario import Servo
 
 
@@ -165,14 +165,14 @@ def compute_tip_poses(arm, q, pose):
     """Compute the tip poses of n episodes from their joint angles.
 
     Args:
-        arm: (9,) of `kinematics.task.arm_parameters`.
+        arm: (9,) of `kinematics.task_space.arm_parameters`.
         q: (n, k) joint angles [rad].
         pose: (n, 5) written: r [m], theta [rad], z [m], attitude [rad], head [rad].
 
     Returns:
         Nothing.
 
-    Source: `kinematics.task.compute_tip_pose`.
+    Source: `kinematics.task_space.compute_tip_pose`.
     """
     for i in range(len(q)):
         compute_tip_pose(arm, q[i], pose[i])
@@ -183,7 +183,7 @@ def compute_joint_angles(arm, ranges, pose, q):
     """Compute the joint angles of n episodes from tip poses; unreachable poses leave `q` unchanged.
 
     Args:
-        arm: (9,) of `kinematics.task.arm_parameters`.
+        arm: (9,) of `kinematics.task_space.arm_parameters`.
         ranges: (k, 2) of the joints [rad].
         pose: (n, 5) r [m], theta [rad], z [m], attitude [rad], head [rad].
         q: (n, k) joint angles, updated [rad].
@@ -191,7 +191,7 @@ def compute_joint_angles(arm, ranges, pose, q):
     Returns:
         Nothing.
 
-    Source: `kinematics.task.solve_joint_angles`.
+    Source: `kinematics.task_space.solve_joint_angles`.
     """
     k = q.shape[1]
     found = np.empty(k)

@@ -6,7 +6,7 @@ rate to actions of the chosen kind.
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import COORDINATES, arm_specification
+from hydrotele.control.arm_kinematics import COORDINATES, arm_specification
 from hydrotele.envs.controllers.controller import (
     Controller,
     ValveServo,
@@ -15,15 +15,10 @@ from hydrotele.envs.controllers.controller import (
     find_observation_columns,
     find_position_columns,
 )
-from hydrotele.envs.controllers.track import RateFeedback
+from hydrotele.envs.controllers.rate_feedback import RateFeedback
 from hydrotele.envs.episode import MAX_ARM_AXES
-from hydrotele.envs.facts import (
-    MAX_ACCELERATION,
-    MAX_POSE_ACCELERATIONS,
-    TaskSetup,
-    full_action_rate,
-)
 from hydrotele.envs.grade import MAX_RADIUS, MEAN_RADIUS, MIN_RADIUS, SECTION_COUNT, profile_section_radii
+from hydrotele.envs.task_setup import MAX_ACCELERATION, MAX_POSE_ACCELERATIONS, TaskSetup, full_action_rate
 
 _INTEGRAL_GAIN = 2.0  # 1/s^2, integral gain of valve actions
 _JOINT_GAINS = (6.0, 1.0)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction

@@ -190,7 +190,7 @@ def floor(problem: Problem, rng: np.random.Generator) -> float:
 
 
 def _units(names: list[str]) -> dict[str, str]:
-    from hydrotele.machine.signals import default_channel_unit
+    from hydrotele.machine.log_channels import default_channel_unit
 
     return {name: default_channel_unit(name, names) for name in names}
 

@@ -11,7 +11,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-from hydrotele.cli.gapping import compute_open_loop_errors
+from hydrotele.cli.gap_command import compute_open_loop_errors
 from hydrotele.core.errors import InputError
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.result import gap_document

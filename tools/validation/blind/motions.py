@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.hydraulics.actuator_layout import actuator_order
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Scenario, Servo, StartState, TablePilot
+from hydrotele.scenario.pilots import TablePilot
+from hydrotele.scenario.scenario import Scenario, Servo, StartState
 
 RATE = 50.0  # Hz, of controller, sensors and log
 SENSORS = "khoshzaban1992"

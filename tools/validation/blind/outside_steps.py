@@ -8,8 +8,9 @@ change the actuators' numbers, activations or applied forces, and no code of the
 import math
 
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
-from hydrotele.hydraulics.laws import axis_valve_opening, orifice_flow
-from hydrotele.simulate.record import state_supply_pressure
+from hydrotele.hydraulics.laws import orifice_flow
+from hydrotele.hydraulics.valve import axis_valve_opening
+from hydrotele.simulate.true_values import state_supply_pressure
 
 _WARM_UP = 40.0  # s
 _REGULATOR = 0.05  # s, of a pump's torque control

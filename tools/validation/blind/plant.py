@@ -8,14 +8,15 @@ import mujoco
 import numpy as np
 from scipy.signal import lsim, lti
 
+from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.hydraulics.circuit import circuit_scratch
-from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensor_set
+from hydrotele.machine.machine import Machine, get_sensor_set
+from hydrotele.machine.sensors import SensorError
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
-from hydrotele.simulate.feedback import simulate_readings
-from hydrotele.simulate.record import state_supply_pressure
+from hydrotele.simulate.sensor_models import simulate_readings
+from hydrotele.simulate.true_values import state_supply_pressure
 from tools.validation.blind.draw import Planted
 from tools.validation.blind.outside import OUTSIDE
 

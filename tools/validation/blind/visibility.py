@@ -11,11 +11,13 @@ import mujoco
 import numpy as np
 
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, get_sensor_set, reading_noise_rms
+from hydrotele.machine.machine import Machine, get_sensor_set, reading_noise_rms
+from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.record import Recorder, start_leapfrog, true_channels
+from hydrotele.simulate.record import Recorder, start_leapfrog
 from hydrotele.simulate.stepping import delayed_commands
+from hydrotele.simulate.true_values import true_channels
 from tools.validation.blind.plant import Recorded, shown
 
 RESTART = 0.5  # s

@@ -9,7 +9,8 @@ import math
 import numpy as np
 
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import SensorError, SensorSet, find_channel_sensor, make_channel_converter
+from hydrotele.machine.machine import find_channel_sensor
+from hydrotele.machine.sensors import SensorError, SensorSet, make_channel_converter
 from tools.validation.blind.world import Added, Drives, Forms, Machine, Mechanism, Sensors
 
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.from_machine import axis_linkage
+from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.logs.log import Log
-from hydrotele.machine import signals
+from hydrotele.machine import log_channels
 from hydrotele.machine.machine import Machine as Facts
 from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from tools.validation.blind.motions import RATE, motions
@@ -248,7 +248,7 @@ def _log(model: Facts, reference: Reference, commands, readings) -> Log:
     return Log(
         time=reference.period * np.arange(len(commands)),
         columns=dict(zip(names, values, strict=True)),
-        units={name: signals.default_channel_unit(name, names) for name in names},
+        units={name: log_channels.default_channel_unit(name, names) for name in names},
         metadata=metadata,
     )
 

@@ -1,0 +1,211 @@
+"""Command line of `hydrotele calibrate`: one function for each type of calibration."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hydrotele.cli.option_values import CommandGroup
+from hydrotele.core.errors import InputError
+
+app = CommandGroup(
+    help="Calibrate the kinematics of a mechanism from measured poses.",
+    no_args_is_help=True,
+)  # fmt: skip
+
+DataOption = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
+HeldOutOption = Annotated[str | None, typer.Option(help="Held-out part of the data; the default is described below.")]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: nothing is written.")]
+MachineOption = Annotated[
+    str, typer.Option("--machine", "-m", help="Machine with a calibrator: shipped name or folder.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+
+
+@app.command(epilog="Example:  hydrotele calibrate arm --data logs --json --out calibrated")
+def arm(
+    data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
+    machine: MachineOption = "calibrator",
+    method: Annotated[str, typer.Option(help="Identification: joint or hierarchical.")] = "joint",
+    poses: Annotated[int, typer.Option(min=10, help="Number of poses used of each log.")] = 300,
+    accuracy_deg: Annotated[
+        float | None, typer.Option(help="Standard deviation of an angle sensor [deg].")
+    ] = None,
+    bad_data: Annotated[bool, typer.Option(help="Detect and exclude corrupted samples.")] = True,
+    drift: Annotated[
+        bool, typer.Option(help="Correct the drift of held links by the arm's own sensors.")
+    ] = True,
+    flexibility: Annotated[
+        bool, typer.Option(help="Estimate the bending of the calibrator's joints under load.")
+    ] = True,
+) -> None:  # fmt: skip
+    """Calibrate the links of an arm from logs of an external calibrator (Khoshzaban 1992).
+
+    Give one log for each link; in each log, only that link moves. With --heldout N, every N-th
+    pose is used for validation and not fitted; default: 5.
+    """
+    from hydrotele.cli.calibrate_arm_command import ArmChoices, calibrate_arm
+
+    choices = ArmChoices(method, poses, accuracy_deg, bad_data, drift, heldout, flexibility)
+    calibrate_arm(data, machine, choices, out, json)
+
+
+@app.command(epilog="Example:  hydrotele calibrate linkage --data logs --json")
+def linkage(
+    data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
+    machine: MachineOption = "calibrator",
+    angles: Annotated[
+        str, typer.Option(help="Joint angles: measured (by sensors) or identified (calibrator).")
+    ] = "measured",
+) -> None:  # fmt: skip
+    """Calibrate the cylinder linkages of an arm from joint angles and cylinder lengths.
+
+    Every fifth sample is used for validation and not fitted.
+    """
+    from hydrotele.cli.calibrate_linkage_command import calibrate_linkage
+
+    if heldout is not None:
+        raise InputError("--heldout", "is not used here: every fifth sample is held out")
+    calibrate_linkage(data, machine, angles, out, json)
+
+
+@app.command(epilog="Example:  hydrotele calibrate machine --data poses --dynamics motions --out calibrated")
+def machine(
+    data: DataOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")],
+    dynamics: Annotated[
+        list[Path] | None,
+        typer.Option(help="Logs for the dynamic step. Repeatable. Default: --data."),
+    ] = None,
+    heldout: Annotated[str | None, typer.Option(help="Held-out run of the dynamic logs.")] = None,
+    json: JsonOption = False,
+    machine: MachineOption = "calibrator",
+) -> None:
+    """Calibrate arm, cylinder linkages, masses and friction in sequence (Khoshzaban 1992, p. 125).
+
+    The folder --data contains one log for each link; in each log, only that link moves, measured
+    by the calibrator. The dynamic step uses the calibrated kinematics. Its logs must contain
+    pressures of the same machine.
+    """
+    from hydrotele.cli.calibrate_machine_command import calibrate_machine
+
+    calibrate_machine(data, dynamics or [], machine, heldout, out, json)
+
+
+@app.command(epilog="Example:  hydrotele calibrate design --out design")
+def design(
+    out: OutOption = None, json: JsonOption = False, machine: MachineOption = "calibrator",
+    accuracy_deg: Annotated[float, typer.Option(help="Error bound of angle sensors [deg].")] = 0.1,
+) -> None:  # fmt: skip
+    """Design a calibrator: arm lengths and ball-joint position for the smallest tip error."""
+    from hydrotele.cli.calibrate_arm_command import design_calibrator
+
+    design_calibrator(machine, accuracy_deg, out, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele calibrate hybrid --data measured --out calibrated   |   "
+    "hydrotele calibrate hybrid --simulate measured --poses 25 --seed 1   |   "
+    "hydrotele calibrate hybrid --data measured --evolution --posterior 8000 --json"
+)
+def hybrid(
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder with poses.csv or poses.parquet.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Nominal robot; default: robot.yaml in the folder, or iwr.")] = None,
+    model: Annotated[str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")] = "auto",
+    parameters: Annotated[str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")] = "all",
+    evolution: Annotated[bool, typer.Option("--evolution", help="Also search by differential evolution.")] = False,
+    posterior: Annotated[
+        int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC, 40 steps or more.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    simulate: Annotated[Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")] = None,
+    poses: Annotated[int, typer.Option(min=1, help="Number of simulated poses.")] = 25,
+    heldout: Annotated[int, typer.Option(min=0, help="Number of simulated held-out poses.")] = 25,
+    choose: Annotated[
+        str,
+        typer.Option(help="Simulated poses: random, or the best of 200 by criterion D, O1 to O5."),
+    ] = "random",
+    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated sensor noise.")] = 1.0,
+    errors: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated errors of 1 mm and 1 mrad.")] = 1.0,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate a serial-parallel robot from measured poses (Wang 2012)."""
+    from hydrotele.cli.calibrate_hybrid_command import calibrate_hybrid, simulate_hybrid_to_folder
+
+    if (data is None) == (simulate is None):
+        raise InputError("calibrate hybrid", "give either --data FOLDER or --simulate FOLDER")
+    if simulate is not None:
+        simulate_hybrid_to_folder(simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose)
+    elif data is not None:
+        calibrate_hybrid(data, robot, model, parameters, evolution, posterior, seed, out, json)
+
+
+@app.command(
+    epilog="Examples:  hydrotele calibrate scara --simulate measured --poses 20   |   "
+    "hydrotele calibrate scara --data measured --out calibrated"
+)
+def scara(
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder of nominal.yaml and measured.csv.")] = None,
+    heldout: Annotated[
+        str | None,
+        typer.Option(help="Held-out poses, numbered from 1, as 3,7; default: each in turn."),
+    ] = None,
+    simulate: Annotated[Path | None, typer.Option(help="Write simulated measurements to this folder.")] = None,
+    poses: Annotated[int, typer.Option(min=4, help="Number of simulated poses.")] = 20,
+    noise: Annotated[
+        float,
+        typer.Option(min=0.0, help="Standard deviation of simulated positions [mm]."),
+    ] = 0.05,
+    seed: Annotated[int, typer.Option(help="Random seed of the simulation, 0 or more.")] = 1,
+    choose: Annotated[int | None, typer.Option(min=2, help="Also list this many most informative poses.")] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate the link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
+    from hydrotele.cli.calibrate_scara_command import calibrate_scara_to_folder, simulate_scara_to_folder
+
+    if simulate is not None:
+        simulate_scara_to_folder(simulate, poses, 1e-3 * noise, seed)
+    if data is not None:
+        calibrate_scara_to_folder(data, heldout, choose, out, json)
+    elif simulate is None:
+        message = "give --data FOLDER, or --simulate FOLDER to create a data set"
+        raise InputError("calibrate scara", message)
+
+
+@app.command(
+    epilog="Examples:  hydrotele calibrate mukca --data my_panda --out calibrated   |   "
+    "hydrotele calibrate mukca --data sets --robot arm.urdf --heldout left --json"
+)
+def mukca(
+    data: Annotated[Path, typer.Option("--data", "-d", help="Folder of PLACE/hole_0.csv, PLACE/hole_1.csv.")],
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            help="Shipped robot, or a YAML, URDF or MJCF file; default: the file in the data"
+            " folder, else the shipped robot that fits best."
+        ),
+    ] = None,
+    heldout: Annotated[
+        str | None,
+        typer.Option(help="Held-out place; default: every place in turn."),
+    ] = None,
+    distance: Annotated[
+        float,
+        typer.Option(min=0.0, help="Distance of neighbouring sockets [mm]; 0 if not known."),
+    ] = 50.0,
+    accuracy: Annotated[float, typer.Option(min=1e-6, help="Standard deviation of that distance [mm].")] = 0.05,
+    unit: Annotated[str, typer.Option(help="Unit of the joint angles: rad or deg.")] = "rad",
+    model: Annotated[
+        str | None,
+        typer.Option(help="Joint model: rigid, gravity, eccentricity or both; default: the most accurate prediction."),
+    ] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate a serial robot from joint angles, with its ball tool held in fixed sockets."""
+    from hydrotele.cli.calibrate_mukca_command import SocketChoices, calibrate_mukca
+
+    choices = SocketChoices(robot, heldout, 1e-3 * distance, 1e-3 * accuracy, unit, model)
+    calibrate_mukca(data, choices, out, json)

@@ -1,0 +1,171 @@
+"""Implement `hydrotele compile`: fill the cache of compiled functions, using several processes.
+
+Each job runs a short task that calls all compiled functions of one group of commands, with the
+argument types that these commands use.
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numba
+import typer
+from llvmlite.binding import get_host_cpu_name
+
+import hydrotele
+from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine, format_bar
+from hydrotele.core.compiled import cache_folder
+from hydrotele.core.errors import InputError
+
+_POLL = 0.2  # s between two checks of the jobs
+
+
+class Job(NamedTuple):
+    """Work of one process.
+
+    Attributes:
+        name: name in the progress bar.
+        run: function that executes the task.
+        seconds: processor time with an empty cache [s]; it determines the order of the jobs and
+            the estimate of the remaining time.
+    """
+
+    name: str
+    run: Callable[[], None]
+    seconds: float
+
+
+def _compile_teleoperation() -> None:
+    from hydrotele.run.tick_loop import compile_tick_loop
+
+    compile_tick_loop()
+
+
+def _compile_runs() -> None:
+    from hydrotele.run.run import run_scenario
+    from hydrotele.scenario.scenario import load_scenario
+
+    for name in ("dig", "press_stiffness"):
+        run_scenario(load_scenario(name, {"duration": "0.2"}))
+
+
+def _compile_environments() -> None:
+    import gymnasium
+
+    from hydrotele.envs import TASK_NAMES
+
+    for name in TASK_NAMES:
+        env = gymnasium.make(f"hydrotele/{name}-v0")
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+
+
+def _compile_gap() -> None:
+    from hydrotele.gap.find import find_gap
+    from hydrotele.logs.dataset import load_dataset
+    from hydrotele.logs.log import save_log
+    from hydrotele.machine.machine_file import load_machine
+    from hydrotele.run.run import run_scenario
+    from hydrotele.scenario.scenario import load_scenario
+
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(2):
+            scenario = load_scenario("excitation", {"duration": "2", "seed": str(k)})
+            save_log(run_scenario(scenario).measured, Path(folder) / f"{k}.parquet")
+        find_gap(load_dataset(Path(folder), load_machine("cat215")), effects=("valve_gain",))
+
+
+JOBS = (
+    Job("gap", _compile_gap, 130.0),
+    Job("environments", _compile_environments, 95.0),
+    Job("teleoperation", _compile_teleoperation, 65.0),
+    Job("runs", _compile_runs, 15.0),
+)
+
+
+def run_job(name: str) -> None:
+    """Run the compilation job of the given name in this process, which fills the cache."""
+    next(job for job in JOBS if job.name == name).run()
+
+
+def compile_all(processes: int | None = None) -> None:
+    """Compile all numerical functions by running jobs in child processes, the longest first.
+
+    A marker file in the cache folder records completion, so that a repeated call does nothing.
+
+    Args:
+        processes: number of parallel processes, default one per core.
+
+    Raises:
+        InputError: there is no usable cache folder, or a job failed.
+    """
+    folder = cache_folder()
+    if folder is None:
+        raise InputError("cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder")
+    complete = folder / f"complete_{_hash_sources_and_versions()}"
+    if complete.exists():
+        typer.echo("all functions are compiled already")
+        return
+    processes = processes or len(os.sched_getaffinity(0))
+    began, line = time.monotonic(), ProgressLine()
+    waiting = sorted(JOBS, key=lambda job: -job.seconds)
+    running: dict[Job, tuple[float, subprocess.Popen]] = {}
+    finished, spent, total = 0.0, 0.0, sum(job.seconds for job in JOBS)
+    try:
+        while waiting or running:
+            while waiting and len(running) < processes:
+                job = waiting.pop(0)
+                running[job] = time.monotonic(), _start(job)
+            time.sleep(_POLL)
+            for job, (start, process) in [*running.items()]:
+                if process.poll() is not None:
+                    del running[job]
+                    finished, spent = finished + job.seconds, spent + time.monotonic() - start
+                    if process.returncode:
+                        raise InputError(f"compilation of {job.name}", _read_last_error_line(process))
+            scale = spent / finished if finished else 1.0  # time relative to `Job.seconds`
+            begun = sum(min((time.monotonic() - start) / scale, job.seconds)
+                        for job, (start, _) in running.items())  # fmt: skip
+            left = (total - finished - begun) * scale / processes
+            if running and time.monotonic() - began > SECONDS_BEFORE_BAR:
+                names = ", ".join(job.name for job in running)
+                line.show(format_bar(names, (finished + begun) / total, left))
+    finally:
+        line.clear()
+        for _, process in running.values():
+            process.kill()
+            process.wait()
+    for old in folder.glob("complete_*"):
+        old.unlink()
+    complete.touch()
+    typer.echo(f"all functions are compiled ({time.monotonic() - began:.0f} s)")
+
+
+def _hash_sources_and_versions() -> str:
+    """Return a hash of all that determines the compiled code: Python, numba, processor and sources."""
+    package = Path(hydrotele.__file__).parent
+    text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
+    for path in sorted(package.rglob("*.py")):
+        text.update(path.read_bytes())
+    return text.hexdigest()[:16]
+
+
+def _start(job: Job) -> subprocess.Popen:
+    code = f"from hydrotele.cli.compile_command import run_job; run_job({job.name!r})"
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", code], stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+def _read_last_error_line(process: subprocess.Popen) -> str:
+    assert process.stderr
+    lines = process.stderr.read().decode(errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"exit status {process.returncode}"

@@ -1,0 +1,360 @@
+"""Environment step in native code: actions, control, sensors, reward and reset.
+
+MuJoCo calls `step_or_reset_simulation` for every simulation from its own threads, without the Python interpreter.
+Joint-rate actions move the joint references; pose-rate actions move them by resolved motion. The
+joint servo tracks the references. The acceleration of the references is limited, since a machine of
+20 t cannot follow a step.
+"""
+# pyright: reportCallIssue=false, reportPrivateImportUsage=false
+# numba's intrinsics are called without their typing context, and carray is its documented API.
+
+import mujoco
+import numpy as np
+from numba import carray, types
+
+from hydrotele.control.control_loop import Controller, TickReference, control_tick
+from hydrotele.control.resolved_motion import step_references_to_pose
+from hydrotele.control.servo import (
+    TABLE_POINTS,
+    ComputedForce,
+    DriveReference,
+    MeasuredState,
+    interpolate_drive_reference,
+)
+from hydrotele.core.compiled import callback, compiled
+from hydrotele.core.memory import address_to_pointer, copy_values, float64_view
+from hydrotele.envs.episode import (
+    DISABLED,
+    JOINT_RATE,
+    MAX_ARM_AXES,
+    MAX_AXES,
+    MAX_CHANNELS,
+    MAX_MEASURES,
+    NEXT_STEP,
+    RESET,
+    RESOLVED_MOTION,
+    SAME_STEP,
+    VALVE,
+    draw_uniform,
+)
+from hydrotele.envs.observation import write_machine_observation
+from hydrotele.envs.task_interface import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TICK,
+    call_task_part,
+    episode_states_view,
+    simulation_view,
+    task_parameters_view,
+)
+from hydrotele.hydraulics.actuator_layout import SLOT_COUNT
+from hydrotele.kinematics.task_space import compute_tip_pose
+from hydrotele.simulate.batch import STATE_KIND
+from hydrotele.simulate.mujoco_c_api import call_mj_set_state
+from hydrotele.simulate.sensor_models import Readings, SensorParameters, convert_to_readings, store_readings
+from hydrotele.simulate.stepping import (
+    CommandDelayLine,
+    SensorHistory,
+    Simulation,
+    apply_sensor_delays,
+    initialise_history,
+    true_sensor_values,
+)
+
+_MAX_REFERENCE_LEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
+
+
+@compiled
+def _clip_action(f, action, a):
+    """Return element `a` of the action clipped to +-1, or 0 if the task locks this action."""
+    return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
+
+
+@compiled
+def _limit_change(now, goal, change):
+    return min(now + change, max(now - change, goal))
+
+
+@compiled
+def _integrate_joint_rates(f, e, action, first):
+    """Integrate rate actions, from index `first` on, to the joint references of the servo.
+
+    Acceleration, joint range and lead over the measured joint are limited.
+    """
+    for a in range(first, f.actions):
+        i = f.driven_axis[a]
+        goal = _clip_action(f, action, a) * f.fastest[i]
+        rate = _limit_change(e.reference_rate[i], goal, f.acceleration * f.period)
+        place = e.reference[i] + f.period * rate
+        low = max(f.ranges[i, 0], e.joint[i] - _MAX_REFERENCE_LEAD)
+        high = min(f.ranges[i, 1], e.joint[i] + _MAX_REFERENCE_LEAD)
+        if place < low or place > high:
+            place, rate = min(high, max(low, e.reference[i])), 0.0
+        e.reference[i], e.reference_rate[i] = place, rate
+
+
+@compiled
+def _integrate_pose_rates(f, e, action):
+    """Integrate tip rate actions to the tip pose, and convert it to the joint references (resolved motion)."""
+    k, wanted = f.arm_axes, np.empty(MAX_ARM_AXES)
+    for c in range(MAX_ARM_AXES):
+        goal = 0.0
+        if c < k:
+            goal = _clip_action(f, action, c) * f.fastest_pose[c]
+        e.pose_rate[c] = _limit_change(e.pose_rate[c], goal, f.accelerations[c] * f.period)
+        wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
+    far = False
+    for i in range(k):
+        far = far or abs(e.reference[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
+    held = far or step_references_to_pose(
+        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
+        e.reference_rate[:k],
+    )  # fmt: skip
+    e.blocked = 1 if held else 0
+    if held:
+        e.pose_rate[:] = 0.0
+        e.reference_rate[:k] = 0.0
+    if far:  # the arm is blocked by an obstacle: continue from its measured position
+        for i in range(k):
+            e.reference[i] = _limit_change(e.joint[i], e.reference[i], _MAX_REFERENCE_LEAD)
+        compute_tip_pose(f.arm, e.reference[:k], e.pose)
+
+
+@compiled
+def convert_action_to_commands(f, e, action):
+    """Convert the action into valve commands, or into references of the servo.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; `command` is written for valve actions, the references and
+            `drive` for all others.
+        action: (actions,) of the agent; values outside +-1 are clipped.
+
+    Returns:
+        Nothing.
+
+    Source: `control.resolved_motion`, `control.servo`.
+    """
+    if f.mode == VALVE:
+        for a in range(f.actions):
+            i = f.driven_axis[a]
+            e.command[i] = _clip_action(f, action, a) * f.limit[i]
+        return
+    if f.mode == RESOLVED_MOTION:
+        _integrate_pose_rates(f, e, action)
+        _integrate_joint_rates(f, e, action, f.arm_axes)
+    elif f.mode == JOINT_RATE:
+        _integrate_joint_rates(f, e, action, 0)
+    k = f.axes
+    table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
+    interpolate_drive_reference(
+        f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
+        e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
+    )  # fmt: skip
+
+
+@compiled
+def update_sensors(f, e, sim):
+    """Sample the sensors if a sample is due, and hold the last sample otherwise.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; true positions are always written, measured values if due.
+        sim: Simulation of this episode.
+
+    Returns:
+        Nothing.
+
+    Source: `simulate.sensor_models`, as in scenario runs.
+    """
+    k, c = f.axes, f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    if e.tick % f.every != 0:
+        for i in range(k):
+            e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
+        return
+    values, scales = np.empty(c), f.scales + 8 * e.variant * MAX_CHANNELS
+    true_sensor_values(sim, values)
+    for i in range(k):
+        e.position[i] = values[i]
+        e.sampled_reference[i] = e.reference[i]
+    apply_sensor_delays(sim.sensor_history, e.tick * f.substeps, values)
+    for i in range(c):
+        e.error[i] = f.accuracy[i] * (2.0 * draw_uniform(e) - 1.0) if f.noisy else 0.0
+    sensors = SensorParameters(
+        float64_view(scales, c), float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c), f.converters[0],
+        f.converters[1], f.converters[2],
+    )  # fmt: skip
+    convert_to_readings(sensors, values, e.error[:c])
+    span = f.every * f.period if e.tick > 0 else 0.0
+    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
+    e.supply = store_readings(values, f.hydraulic, span, readings)
+
+
+assert MAX_CHANNELS >= 3 * MAX_AXES + 1
+
+
+_WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
+_FIRST_BAD_STATE, _LAST_BAD_STATE = (
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+)
+_SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
+
+
+@compiled
+def _make_simulation_record(f, e, w):
+    """Collect the arrays of an episode's simulation, with its delay lines, in a record for `simulate.stepping`."""
+    ring = float64_view(f.commands + 8 * w.index * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
+        (f.delayed_command, MAX_AXES)
+    )
+    delays = float64_view(f.delays + 8 * e.variant * MAX_AXES * 2, MAX_AXES * 2).reshape((MAX_AXES, 2))
+    c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    sensed = float64_view(
+        f.sensed + 8 * w.index * f.delayed_sensor * MAX_CHANNELS,
+        f.delayed_sensor * MAX_CHANNELS,
+    ).reshape((f.delayed_sensor, MAX_CHANNELS))
+    lags = float64_view(f.lags + 8 * e.variant * MAX_CHANNELS * 2, MAX_CHANNELS * 2).reshape((MAX_CHANNELS, 2))
+    past = SensorHistory(
+        sensed, float64_view(f.sensed_before + 8 * w.index * MAX_CHANNELS, c), lags,
+        float64_view(f.ratios + 8 * e.variant * MAX_CHANNELS, MAX_CHANNELS),
+    )  # fmt: skip
+    none = f.qpos[:0]
+    user = float64_view(f.users + 8 * e.variant * f.axes * SLOT_COUNT, f.axes * SLOT_COUNT)
+    return Simulation(
+        f.mj_step, w.model, w.data, w.qpos, w.qvel, w.act, w.ctrl, f.timestep, f.axes, f.hydraulic,
+        f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandDelayLine(ring, delays), past,
+    )  # fmt: skip
+
+
+@compiled
+def _run_control_period(f, e, sim):
+    """Run the joint servo and then the physics steps of one control period."""
+    k, none = f.axes, np.zeros(f.axes)
+    controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
+    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
+    reference = TickReference(
+        e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
+    )  # fmt: skip
+    measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
+    control_tick(sim, e.tick, f.substeps, controller, reference, measured)
+
+
+@compiled
+def _check_stability(f, e, d):
+    """Count and clear MuJoCo's warnings; return whether a state was infinite or NaN."""
+    warnings = carray(address_to_pointer(d + f.at_warning), (_WARNING_COUNT, 2), np.int32)  # (information, number)
+    bad = False
+    for kind in range(_WARNING_COUNT):
+        if warnings[kind, 1] > 0:
+            e.warnings += warnings[kind, 1]
+            bad = bad or _FIRST_BAD_STATE <= kind <= _LAST_BAD_STATE
+            warnings[kind, 1] = 0
+    return bad
+
+
+@compiled
+def _begin_episode(f, e, w):
+    """Draw a variant, set the simulation to its start, and draw a new goal."""
+    e.last_variant, e.last_fault = e.variant, e.fault
+    e.variant = int(draw_uniform(e) * f.variants)
+    start = f.starts + 8 * e.variant * f.states
+    call_mj_set_state(f.mj_set_state, w.model, w.data, start, STATE_KIND)
+    places = carray(address_to_pointer(f.places), (3 * f.fields,), np.int64)
+    for n in range(f.fields):
+        size = places[3 * n + 2]
+        given = float64_view(places[3 * n] + 8 * e.variant * size, size)
+        taken = float64_view(places[3 * n + 1] + 8 * w.index * size, size)
+        for c in range(size):
+            taken[c] = given[c]
+    e.episode += 1
+    e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
+    e.command[:] = 0.0
+    for i in range(f.axes):
+        e.command[i] = w.ctrl[i]
+    sim = _make_simulation_record(f, e, w)
+    initialise_history(sim, w.ctrl)
+    tips = float64_view(f.start_tips + 24 * e.variant, 3)
+    copy_values(e.tip, tips)
+    e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
+    update_sensors(f, e, sim)
+    for i in range(len(e.joint)):
+        e.reference[i] = e.sampled_reference[i] = e.joint[i]
+    if f.arm_axes > 0:
+        compute_tip_pose(f.arm, e.reference[: f.arm_axes], e.pose)
+    for i in range(f.hydraulic):
+        e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
+    w.measures[:] = 0.0
+    call_task_part(f, w, BEGIN, 0)
+
+
+@compiled
+def _write_observation(f, e, w, address):
+    """Write the observation of a simulation to an array at `address`, clipped to its bounds."""
+    n = f.observations
+    out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
+    low = carray(address_to_pointer(f.low), (n,), np.float32)
+    high = carray(address_to_pointer(f.high), (n,), np.float32)
+    at = write_machine_observation(f, e, out)
+    call_task_part(f, w, OBSERVE, address + 4 * (w.index * n + at))
+    for c in range(n):
+        if not low[c] <= out[c] <= high[c]:
+            e.saturated += 1
+            out[c] = min(high[c], max(low[c], out[c])) if np.isfinite(out[c]) else low[c]
+
+
+@compiled
+def _run_environment_step(f, e, w, action):
+    """Run one environment step; return the reward, `terminated` and `truncated`."""
+    sim = _make_simulation_record(f, e, w)
+    for _ in range(f.ticks):
+        convert_action_to_commands(f, e, action)
+        _run_control_period(f, e, sim)
+        e.tick += 1
+        update_sensors(f, e, sim)
+        call_task_part(f, w, TICK, 0)  # after the physics: before it, body positions belong to another simulation
+    copy_values(e.tip, w.tip)
+    e.step += 1
+    if _check_stability(f, e, w.data):
+        e.fault = 1
+        e.faults += 1
+        return 0.0, True, False
+    reward = call_task_part(f, w, REWARD, 0)
+    done = e.over != 0
+    return reward, done, e.step >= f.horizon and not done
+
+
+@compiled
+def _step_or_reset_simulation(m, d, sim, argument):
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[sim], simulation_view(f, m, d, sim, argument)
+    reward = carray(address_to_pointer(f.reward), (f.count,), np.float64)
+    terminated = carray(address_to_pointer(f.terminated), (f.count,), np.uint8)
+    truncated = carray(address_to_pointer(f.truncated), (f.count,), np.uint8)
+    reward[sim], terminated[sim], truncated[sim] = 0.0, 0, 0
+    fresh = f.call == RESET or (f.autoreset == NEXT_STEP and e.over != 0)
+    if fresh:
+        _begin_episode(f, e, w)
+        _write_observation(f, e, w, f.observation)
+        return
+    if f.autoreset == DISABLED and e.over != 0:
+        return
+    action = carray(address_to_pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
+    value, done, late = _run_environment_step(f, e, w, action)
+    reward[sim], terminated[sim], truncated[sim] = value, done, late
+    e.over = 1 if done or late else 0
+    if f.autoreset == SAME_STEP and e.over != 0:
+        copy_values(float64_view(f.final_measures + 8 * sim * MAX_MEASURES, MAX_MEASURES), w.measures)
+        _write_observation(f, e, w, f.final)
+        _begin_episode(f, e, w)
+    _write_observation(f, e, w, f.observation)
+
+
+@callback(_SIGNATURE)
+def step_or_reset_simulation(m, d, sim, argument):
+    """Step or reset one simulation.
+
+    The arguments are the addresses of mjModel and mjData, the index of the simulation and the address of
+    TASK_PARAMETERS, whose `call` selects step or reset.
+    """
+    _step_or_reset_simulation(m, d, sim, argument)

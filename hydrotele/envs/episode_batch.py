@@ -1,0 +1,262 @@
+"""Run n parallel episodes of a task, stepped by one native call.
+
+The `gymnasium` and `dm_env` environments, single and batched, are wrappers around `TaskCore`.
+"""
+
+import copy
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from hydrotele.control.arm_kinematics import arm_axes
+from hydrotele.control.servo import tabulate_drive_geometry
+from hydrotele.core.errors import InputError
+from hydrotele.envs.environment_step import step_or_reset_simulation
+from hydrotele.envs.episode import (
+    EPISODE_STATE,
+    MAX_AXES,
+    MAX_CHANNELS,
+    MAX_MEASURES,
+    NEXT_STEP,
+    RESET,
+    STEP,
+    make_seed_states,
+)
+from hydrotele.envs.observation import list_machine_observation_fields
+from hydrotele.envs.task import Options, Task
+from hydrotele.envs.task_parameters import make_task_parameters
+from hydrotele.envs.task_setup import TaskSetup, make_timing
+from hydrotele.envs.variants import make_variants
+from hydrotele.machine.machine_file import load_machine
+from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
+from hydrotele.simulate.batch import SimulationBatch
+from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
+
+MAX_ENVIRONMENTS = 100_000
+"""Largest number of parallel episodes; each needs about 100 kB of memory."""
+MAX_VARIANTS = 10_000
+"""Largest number of variants; each takes some milliseconds to prepare."""
+MAX_THREADS = 1024
+"""Largest number of threads that step the episodes."""
+
+
+def check_count(name: str, count: int, least: int, most: int) -> None:
+    """Raise an error unless a count is an integer in a range.
+
+    Raises:
+        InputError: the count is not an integer, or out of range.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not least <= count <= most:
+        raise InputError(name, f"must be a whole number from {least} to {most}, not {count!r}")
+
+
+def make_task_setup(task: Task, options: Options) -> TaskSetup:
+    """Combine a task with the user's options: load its machines, observation and clocks.
+
+    Args:
+        task: the task.
+        options: the user's options.
+
+    Returns:
+        The setup.
+
+    Raises:
+        InputError: an option is not valid for the task.
+    """
+    options = dataclasses.replace(
+        options, action=options.action or task.action,
+        duration=task.duration if options.duration is None else options.duration,
+    )  # fmt: skip
+    check_count("variants", options.variants, 1, MAX_VARIANTS)
+    machine, clock = load_machine(task.machine, task.tool), make_timing(options)
+    arm = arm_axes(machine)
+    axes = (*arm, *task.extra_axes)
+    variants = make_variants(task, options, machine)
+    fields = [*list_machine_observation_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
+    table = tabulate_drive_geometry(machine, variants.plant.axes)[1]
+    return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
+
+
+class TaskCore:
+    """n parallel episodes of a task.
+
+    Native code updates the arrays in place.
+
+    Attributes:
+        setup: the task with its options.
+        count: number of episodes n.
+        simulations: the batch of simulation states.
+        episodes: (n,) records of EPISODE_STATE.
+        observation: (n, o) float32.
+        final_observation: (n, o) float32 observations before an autoreset in the same step.
+        reward: (n,).
+        terminated: (n,) uint8.
+        truncated: (n,) uint8.
+        measures: (n, MAX_MEASURES) task measures of the step, reported in `info`.
+        final_measures: (n, MAX_MEASURES) the same before an autoreset in the same step.
+    """
+
+    def __init__(
+        self, task: Task, options: Options, count: int = 1, threads: int = 1,
+        autoreset: int = NEXT_STEP,
+    ) -> None:  # fmt: skip
+        """Compile the machines and allocate the arrays.
+
+        Args:
+            task: the task.
+            options: the user's options.
+            count: number of parallel episodes.
+            threads: number of threads that step the episodes; 0 for one per core.
+            autoreset: NEXT_STEP, SAME_STEP or DISABLED.
+
+        Raises:
+            InputError: an option is not valid for the task.
+        """
+        stop_profiling_clock()
+        check_count("num_envs", count, 1, MAX_ENVIRONMENTS)
+        check_count("threads", threads, 0, MAX_THREADS)
+        self.count, self.setup = int(count), make_task_setup(task, options)
+        self.simulations = SimulationBatch(self.setup.variants.plant.model, count, threads)
+        self._allocate_arrays()
+        self.parameters = make_task_parameters(self.setup, count, autoreset)
+        self._store_array_addresses()
+        self._is_started = np.zeros(count, bool)
+
+    def _allocate_arrays(self) -> None:
+        n, o, v = self.count, len(self.setup.fields), self.setup.variants
+        self.episodes = np.zeros(n, EPISODE_STATE)
+        self.action = np.zeros((n, len(self.setup.axes)), np.float32)
+        self.observation, self.final_observation = (np.zeros((n, o), np.float32) for _ in range(2))
+        self.observation_low = np.array([field.low for field in self.setup.fields], np.float32)
+        self.observation_high = np.array([field.high for field in self.setup.fields], np.float32)
+        self.reward = np.zeros(n)
+        self.measures, self.final_measures = (np.zeros((n, MAX_MEASURES)) for _ in range(2))
+        self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
+        self.terrain = np.zeros((n, self.setup.task.terrain_size))
+        self._commands = np.zeros((n, delay_line_length(v.command_delays, self.setup.clock.substeps), MAX_AXES))
+        self._sensed = np.zeros((n, sensor_history_length(v.sensor_delays, v.lag_ratios), MAX_CHANNELS))
+        self._sensed_before = np.zeros((n, MAX_CHANNELS))
+        self._expanded_fields = {name: self.simulations.expand_field_per_simulation(name) for name in v.fields}
+        for name, live in self._expanded_fields.items():
+            if live.shape[1] != v.fields[name].shape[1]:  # native code copies one into the other
+                message = f"variants cannot differ in {name}: the model has colliding meshes"
+                raise InputError("randomise", message)
+        same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
+        self._actuator_parameters = np.ascontiguousarray(v.fields.get("actuator_user", same))
+
+    def _store_array_addresses(self) -> None:
+        """Store the addresses of all arrays in the record that native code reads."""
+        v, f = self.setup.variants, self.parameters
+        f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
+        rows = [(v.fields[n].ctypes.data, live.ctypes.data, v.fields[n].shape[1])
+                for n, live in self._expanded_fields.items()]  # fmt: skip
+        self._field_addresses = np.array(rows, np.int64).reshape(-1, 3)
+        f["fields"] = len(rows)
+        for name, array in (
+            ("episodes", self.episodes), ("action", self.action), ("observation", self.observation),
+            ("final", self.final_observation), ("low", self.observation_low), ("high", self.observation_high),
+            ("reward", self.reward), ("terminated", self.terminated),
+            ("truncated", self.truncated), ("measures", self.measures),
+            ("final_measures", self.final_measures), ("starts", v.states),
+            ("start_tips", v.start_tips), ("users", self._actuator_parameters), ("scales", v.sensor_scales),
+            ("offsets", v.sensor_offsets), ("lags", v.sensor_delays), ("ratios", v.lag_ratios),
+            ("delays", v.command_delays), ("commands", self._commands), ("sensed", self._sensed),
+            ("sensed_before", self._sensed_before), ("places", self._field_addresses), ("terrain", self.terrain),
+        ):  # fmt: skip
+            f[name] = array.ctypes.data
+        if "eq_data" in self._expanded_fields:
+            f["eq_rows"] = self._expanded_fields["eq_data"].ctypes.data
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the actions: axes, or tip coordinates and the axes beyond the arm."""
+        setup = self.setup
+        if setup.options.action != "resolved_motion":
+            return setup.axes
+        names = ("r", "theta", "z", "attitude", "head")[: setup.arm_axes]
+        return (*names, *setup.axes[setup.arm_axes :])
+
+    @property
+    def bytes_per_environment(self) -> int:
+        """Memory per environment: simulation state, episode record and results [byte]."""
+        arrays = (
+            self.episodes, self.action, self.observation, self.final_observation, self.reward, self.terminated,
+            self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
+            self._sensed, self._sensed_before, self.simulations.state, *self._expanded_fields.values(),
+        )  # fmt: skip
+        return sum(array.nbytes for array in arrays) // self.count
+
+    def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
+        """Start new episodes.
+
+        Args:
+            seeds: (m,) integers; None continues the random stream of each episode.
+            chosen: (m,) indices of simulations, None for all.
+
+        Raises:
+            RuntimeError: no seeds have ever been given, or the first reset does not include all
+                episodes.
+            ValueError: a seed is negative or exceeds 64 bits.
+        """
+        place = slice(None) if chosen is None else chosen
+        begun = self._is_started.copy()
+        begun[place] = True
+        if not begun.all():
+            raise RuntimeError("the first reset must begin all episodes: give it no mask")
+        if seeds is not None:
+            self.episodes["random"][place] = make_seed_states(seeds)
+        elif not self._is_started.all():
+            raise RuntimeError("the first reset needs seeds")
+        self._is_started = begun
+        self.parameters["call"] = RESET
+        ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
+        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data, ids)
+
+    def step(self, action: np.ndarray) -> None:
+        """Advance all episodes by one environment step.
+
+        Args:
+            action: (n, a), or (a,) for all episodes; values outside +-1 are clipped.
+
+        Raises:
+            ValueError: the shape is wrong, or an action is not a finite real number.
+            RuntimeError: the episodes have not been reset, or the simulations were closed.
+        """
+        if not self._is_started.all():
+            raise RuntimeError("reset before the first step")
+        values, wanted = np.asarray(action), self.action.shape
+        if values.shape not in (wanted, wanted[1:]):
+            raise ValueError(f"the action must have shape {wanted}, not {values.shape}")
+        if values.dtype.kind not in "fiub":
+            raise ValueError(f"the action must consist of real numbers, not of {values.dtype}")
+        if not np.isfinite(values).all():
+            raise ValueError("all actions must be finite numbers")
+        np.clip(values, -1.0, 1.0, out=self.action, casting="unsafe")  # large float64 numbers exceed float32
+        self.parameters["call"] = STEP
+        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data)
+
+    def step_single(self, action: np.ndarray) -> None:
+        """Advance a single episode; like `step`, but the action must have shape (a,)."""
+        wanted = self.action.shape[1:]
+        if np.shape(action) != wanted:
+            raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
+        self.step(action)
+
+    def copy_model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Return copies of the model and data of one simulation, after `mj_forward`."""
+        model = copy.copy(self.setup.variants.plant.model)
+        data = mujoco.MjData(model)
+        self.simulations.copy_model_into(number, model)
+        self.simulations.copy_data_into(number, data)
+        mujoco.mj_forward(model, data)
+        return model, data
+
+    def close(self) -> None:
+        """Free the memory of the simulations."""
+        self._expanded_fields = {}
+        self.simulations.close()
+
+    def __reduce__(self):
+        """Raise TypeError: the simulations can be neither copied nor pickled."""
+        return self.simulations.__reduce__()

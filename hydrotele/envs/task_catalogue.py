@@ -1,0 +1,81 @@
+"""Tasks by name, and running tasks made from a name and the user's options."""
+
+import dataclasses
+from typing import Any, get_type_hints
+
+import numpy as np
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from hydrotele.core.datafile import suggest_valid_name
+from hydrotele.core.errors import InputError
+from hydrotele.envs.environment_step import step_or_reset_simulation
+from hydrotele.envs.episode_batch import TaskCore
+from hydrotele.envs.grade import GRADE
+from hydrotele.envs.hold_force import HOLD_FORCE
+from hydrotele.envs.place_log import PLACE_LOG
+from hydrotele.envs.reach_feller import REACH_FELLER
+from hydrotele.envs.straight_line import STRAIGHT_LINE
+from hydrotele.envs.task import Options
+from hydrotele.envs.track_trajectory import TRACK_TRAJECTORY
+
+TASKS = {
+    task.name: task
+    for task in (
+        TRACK_TRAJECTORY,
+        STRAIGHT_LINE,
+        HOLD_FORCE,
+        REACH_FELLER,
+        GRADE,
+        PLACE_LOG,
+    )
+}
+"""Tasks by name."""
+
+_STRICT_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
+_OPTION_TYPES: dict[str, TypeAdapter] = {
+    name: TypeAdapter(hint, config=_STRICT_CONFIG) for name, hint in get_type_hints(Options).items()
+}
+_COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import precompile_loop_residuals as compile_; compile_()"
+
+
+def make_task_core(task: str, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
+    """Make a running task from its name and options.
+
+    Args:
+        task: name of the task.
+        choices: fields of `envs.task.Options`.
+        count: number of environments.
+        threads: number of threads that step the environments, 0 for one per core.
+        autoreset: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
+
+    Returns:
+        The core.
+
+    Raises:
+        InputError: the task or an option does not exist, or a value is not valid.
+    """
+    if task not in TASKS:
+        raise InputError(f"task {task!r}", suggest_valid_name(task, TASKS))
+    known = {field.name for field in dataclasses.fields(Options)}
+    if strange := set(choices) - known:
+        name = sorted(strange)[0]
+        raise InputError(f"environment option {name!r}", suggest_valid_name(name, known))
+    options = _validate_options(choices)
+    step_or_reset_simulation.compile_in_background(
+        _COMPILE_LOOPS_COMMAND
+    )  # while the plant's own code is compiled here
+    return TaskCore(TASKS[task], options, count, threads, autoreset)
+
+
+def _validate_options(choices: dict[str, Any]) -> Options:
+    """Validate the type of every option; `variants="3"` and NaN are errors."""
+    kept: dict[str, Any] = {}
+    for name, value in choices.items():
+        plain = value.item() if isinstance(value, np.generic) else value
+        plain = tuple(plain) if isinstance(plain, list) else plain
+        try:
+            kept[name] = _OPTION_TYPES[name].validate_python(plain)
+        except ValidationError as error:
+            message = f"{error.errors()[0]['msg']}; got {value!r}"
+            raise InputError(f"environment option {name!r}", message) from None
+    return Options(**kept)

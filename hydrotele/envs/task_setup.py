@@ -1,0 +1,110 @@
+"""A task with its options.
+
+Clocks, driven axes, machine variants, observation fields, and the limits of rates and accelerations
+in SI units.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.core.errors import InputError
+from hydrotele.envs.observation import ObservationField
+from hydrotele.envs.task import Options, Task
+from hydrotele.envs.variants import Variants
+from hydrotele.kinematics.drive_linkage import axis_linkage
+from hydrotele.machine.machine import Machine
+
+_MIN_CONTROL_RATE = 200.0  # Hz, minimum control rate of the servo
+_FULL_RATE_FRACTION = 0.8  # fraction of the speed at rated or pump flow that a full action commands
+_FORCE_DRIVE_RATE = 0.5  # rad/s or m/s, rate of a force drive at full action
+MAX_ACCELERATION = 1.0  # rad/s^2 or m/s^2, limit of the joint references
+MAX_POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2, limits of the pose reference
+
+
+class Timing(NamedTuple):
+    """Clocks of an environment.
+
+    Attributes:
+        ticks: control periods per environment step.
+        substeps: physics steps per control period.
+        period: control period [s].
+        horizon: environment steps per episode.
+    """
+
+    ticks: int
+    substeps: int
+    period: float
+    horizon: int
+
+
+class TaskSetup(NamedTuple):
+    """A task with its options.
+
+    Attributes:
+        task: the task.
+        options: the user's options with all defaults filled in.
+        clock: clocks of the environment.
+        machine: the machine without added or randomised effects, as a controller knows it.
+        axes: driven axes in the order of the actions (`valve`, `joint_rate`).
+        arm_axes: number of arm axes, which come first in `axes`.
+        variants: machines and starts of the episodes.
+        fields: fields of the observation.
+        drive_table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drive_geometry`.
+    """
+
+    task: Task
+    options: Options
+    clock: Timing
+    machine: Machine
+    axes: tuple[str, ...]
+    arm_axes: int
+    variants: Variants
+    fields: list[ObservationField]
+    drive_table: np.ndarray
+
+
+def make_timing(options: Options) -> Timing:
+    """Return the clocks for the given options.
+
+    Raises:
+        InputError: a rate is out of range, or the control period is not a whole number of physics
+            steps.
+    """
+    rate, step = options.control_rate, options.timestep
+    if not (0.0 < rate <= 1.0e4 and 1.0e-5 <= step <= 5.0e-3):
+        message = (
+            f"{rate:g} Hz with a physics step of {step:g} s is out of range: at most 10000 Hz, and"
+            " a physics step from 1e-05 to 0.005 s"
+        )
+        raise InputError("control_rate", message)
+    ticks = max(1, round(_MIN_CONTROL_RATE / rate))
+    substeps = 1.0 / (rate * ticks * step)
+    if substeps < 0.999 or abs(substeps - round(substeps)) > 1e-6:
+        message = f"{rate:g} Hz needs a control period of whole physics steps of {step:g} s; use for example 50 or 200"
+        raise InputError("control_rate", message)
+    assert options.duration is not None
+    horizon = round(options.duration * rate)
+    if horizon < 1:
+        raise InputError("duration", f"{options.duration:g} s is shorter than one step")
+    return Timing(ticks, round(substeps), round(substeps) * step, horizon)
+
+
+def full_action_rate(machine: Machine, axis: str) -> float:
+    """Return the rate of an axis at full action, which its drive reaches in its whole range.
+
+    Args:
+        machine: the machine.
+        axis: name of the axis.
+
+    Returns:
+        The rate [rad/s] or [m/s]: 0.8 times the smaller of rated valve flow and pump flow, divided by the
+        head-side area and the largest moment arm; 0.5 for an axis without a valve.
+    """
+    facts = machine.axes[axis]
+    low, high = machine.joints[facts.joint].range or (-1.0, 1.0)
+    if not (facts.valve and machine.supply):
+        return _FORCE_DRIVE_RATE
+    arm = np.abs(axis_linkage(machine, axis).rate(np.linspace(low, high, 101))).max()
+    flow = min(facts.valve.rated_flow, machine.supply.pump_flow)
+    return _FULL_RATE_FRACTION * flow / facts.hydraulic_drive.effective_areas[0] / float(arm)

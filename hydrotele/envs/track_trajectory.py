@@ -1,0 +1,212 @@
+"""The task `TrackTrajectory`: all axes track Fourier references.
+
+Every episode draws three harmonics per axis with a common period, faded in from rest. The
+amplitudes are scaled so that the rates stay within a fraction of the drive rates, and the positions
+within the joint ranges.
+"""
+
+import math
+
+import numpy as np
+
+from hydrotele.core.compiled import callback, compiled
+from hydrotele.envs.episode import MAX_ARM_AXES, MAX_AXES, draw_uniform, draw_uniform_between
+from hydrotele.envs.observation import ObservationField, make_position_observation_field, make_rate_observation_field
+from hydrotele.envs.task import Task
+from hydrotele.envs.task_interface import (
+    BEGIN,
+    OBSERVE,
+    REWARD,
+    TASK_SIGNATURE,
+    episode_states_view,
+    observation_view,
+    simulation_view,
+    store_episode_end,
+    task_parameters_view,
+)
+from hydrotele.kinematics.task_space import compute_tip_pose
+from hydrotele.machine.machine import Machine
+
+PREVIEW_TIMES = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
+ERROR_PER_REWARD = 0.1  # m of error that costs a reward of 1
+_HARMONIC_COUNT = 3  # number of harmonics per axis
+_FADE_TIME = 2.0  # s, fade-in time
+_MIN_PERIOD, _MAX_PERIOD = 8.0, 16.0  # s, range of the period
+_MIN_RATE_FRACTION, _MAX_RATE_FRACTION = (
+    0.3,
+    0.7,
+)  # range of the maximum rate, as a fraction of the drive rate
+_MAX_RANGE_FRACTION = 0.9  # maximum amplitude as a fraction of the distance to the joint limit
+_DEFAULT_RANGE = 1.5  # rad or m, the same distance for an axis without limits
+_FREQUENCY = 0
+_BASE = 1
+_SINE = _BASE + MAX_AXES
+_COSINE = _SINE + _HARMONIC_COUNT * MAX_AXES
+
+
+def list_track_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
+    """Return the observation fields that `write_track_observation` writes: references, their rates and previews."""
+    fields = [make_position_observation_field(machine, name, "reference") for name in axes]
+    fields += [make_rate_observation_field(machine, name, "reference_rate") for name in axes]
+    for ahead in PREVIEW_TIMES:
+        label = f"reference_in_{ahead * 1000:.0f}_ms"
+        fields += [make_position_observation_field(machine, name, label) for name in axes]
+    return fields
+
+
+@compiled
+def draw_track_references(f, e):
+    """Draw the goal of an episode: random Fourier references within the ranges and rates of the axes.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE; the Fourier coefficients are written to `goal`.
+
+    Returns:
+        Nothing.
+
+    Source: this module.
+    """
+    g = e.goal
+    g[_FREQUENCY] = 2.0 * math.pi / draw_uniform_between(e, _MIN_PERIOD, _MAX_PERIOD)
+    for a in range(f.axes_driven):
+        i = f.driven_axis[a]
+        g[_BASE + i] = e.reference[i]
+        fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i]
+        total, rate = 0.0, 0.0
+        for h in range(_HARMONIC_COUNT):
+            place = _HARMONIC_COUNT * i + h
+            size, phase = draw_uniform(e), draw_uniform_between(e, -math.pi, math.pi)
+            g[_SINE + place], g[_COSINE + place] = size * math.cos(phase), size * math.sin(phase)
+            total += size
+            rate += size * (h + 1) * g[_FREQUENCY]
+        low, high = f.ranges[i, 0] - g[_BASE + i], f.ranges[i, 1] - g[_BASE + i]
+        room = max(0.0, _MAX_RANGE_FRACTION * min(-low, high, _DEFAULT_RANGE))
+        # relative to its start, a sine reaches up to twice its amplitude on one side
+        scale = min(fastest / rate, 0.5 * room / total)
+        for h in range(_HARMONIC_COUNT):
+            g[_SINE + _HARMONIC_COUNT * i + h] *= scale
+            g[_COSINE + _HARMONIC_COUNT * i + h] *= scale
+
+
+@compiled
+def compute_axis_reference(g, i, time):
+    """Return the reference position of an axis at a time, and its rate.
+
+    Args:
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
+        i: index of the axis, scalar.
+        time: since the start, scalar [s].
+
+    Returns:
+        (position [rad] or [m], rate [rad/s] or [m/s]), scalars.
+
+    Source: this module.
+    """
+    wave, rate = 0.0, 0.0
+    first_sine, first_cosine = math.sin(g[_FREQUENCY] * time), math.cos(g[_FREQUENCY] * time)
+    sine, cosine = first_sine, first_cosine
+    for h in range(_HARMONIC_COUNT):
+        along, across = g[_SINE + _HARMONIC_COUNT * i + h], g[_COSINE + _HARMONIC_COUNT * i + h]
+        wave += along * sine + across * (cosine - 1.0)
+        rate += (h + 1) * g[_FREQUENCY] * (along * cosine - across * sine)
+        sine, cosine = (
+            sine * first_cosine + cosine * first_sine,
+            cosine * first_cosine - sine * first_sine,
+        )
+    if time >= _FADE_TIME:
+        return g[_BASE + i] + wave, rate
+    part = max(0.0, time / _FADE_TIME)
+    share = part * part * (3.0 - 2.0 * part)
+    growth = 6.0 * part * (1.0 - part) / _FADE_TIME
+    return g[_BASE + i] + share * wave, share * rate + growth * wave
+
+
+@compiled
+def write_track_observation(f, e, out, at):
+    """Write the references of all axes, their rates and the references ahead to the observation.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
+        out: (observations,) float32, written from index `at` on.
+        at: index of the first value to write, scalar.
+
+    Returns:
+        Nothing.
+
+    Source: `list_track_observation_fields`.
+    """
+    now, n = e.tick * f.period, f.axes_driven
+    for a in range(n):
+        i = f.driven_axis[a]
+        out[at + a], out[at + n + a] = compute_axis_reference(e.goal, i, now)
+        for p in range(len(PREVIEW_TIMES)):
+            out[at + (2 + p) * n + a] = compute_axis_reference(e.goal, i, now + PREVIEW_TIMES[p])[0]
+
+
+@compiled
+def compute_track_reward(f, e, w):
+    """Compute the reward: 1 minus 1 for every 0.1 m of tip error, at least -1.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
+        w: SimulationView; `measures` receives the distance of the tip from its reference [m].
+
+    Returns:
+        (reward, False), scalars.
+
+    Source: this module.
+    """
+    now = e.tick * f.period
+    q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
+    for i in range(f.arm_axes):
+        q[i] = compute_axis_reference(e.goal, i, now)[0]
+    compute_tip_pose(f.arm, q, pose)
+    x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
+    square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2
+    error = math.sqrt(square)
+    w.measures[0] = error
+    return max(-1.0, 1.0 - error / ERROR_PER_REWARD), False
+
+
+@callback(TASK_SIGNATURE)
+def run_task_part(part, m, d, number, argument, out):
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+    mjModel, mjData, TASK_PARAMETERS and the observation.
+    """
+    f = task_parameters_view(argument)[0]
+    e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
+    if part == BEGIN:
+        draw_track_references(f, e)
+    elif part == OBSERVE:
+        write_track_observation(f, e, observation_view(f, out), 0)
+    elif part == REWARD:
+        return store_episode_end(e, compute_track_reward(f, e, w))
+    return 0.0
+
+
+def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+    """Draw axis positions uniformly from the middle 40 % of their ranges."""
+    places = {}
+    for name, axis in machine.axes.items():
+        low, high = machine.joints[axis.joint].range or (-0.5, 0.5)
+        places[name] = float(low + (high - low) * rng.uniform(0.3, 0.7))
+    return places
+
+
+TRACK_TRAJECTORY = Task(
+    name="TrackTrajectory",
+    kind="track",
+    description="All axes of an excavator without a tool track Fourier references.",
+    reward="The reward is 1 minus 1 for every 0.1 m of tip error, at least -1.",
+    machine="cat215",
+    tool="none",
+    start=_sample_start_positions,
+    fields=list_track_observation_fields,
+    measures=(("tip_error", "m"),),
+)
