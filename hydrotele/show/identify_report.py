@@ -152,6 +152,11 @@ def _mechanism_content(found: Identification, best: ConsistentParameters | None)
         "run": found.forces.run, "band": f"{found.band:.3g}", "forces": forces,
         "pictures": [(drive, draw_force_predictions(found.forces, drive, h))
                      for drive, h in found.heldout.items()],
+        "friction": [
+            (_display_name(f.drive), f"{f.speed:g} {'m/s' if f.unit == 'N' else 'rad/s'}", amount(f.force, f.unit),
+             " to ".join(amount(limit, f.unit) for limit in f.ci95))
+            for f in found.friction
+        ],
         "condition": f"{found.estimate.condition:.3g}", "parameters": _parameters(found),
         "tests": _consistency_test_rows(found, best), "statuses": _identifiability_rows(found),
         "correlation": ", ".join(f"{_display_name(drive)} {r:.2f}" for drive,

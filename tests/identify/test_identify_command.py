@@ -61,6 +61,9 @@ def test_the_machine_and_the_report_stand_in_the_folder(identified):
     assert axis.cylinder.friction.viscous == pytest.approx(viscous, rel=0.05)
     page = (target / "report.html").read_text()
     assert "Force prediction errors on held-out data" in page and "data:image/png" in page
+    assert document["friction"]
+    for force in document["friction"]:
+        assert f">{force['speed']:g} m/s<" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     summary = json.loads((target / "summary.json").read_text())
     assert summary["kind"] == "identify" and summary["heldout"] == "run_2"
