@@ -377,7 +377,8 @@ STRUCTURE = Experiment(
             '"The rigid-body part contains 10 base parameters (see Table 1)." "The friction model'
             ' contains therefore 14 different parameters."',
             "Table 1, section 5.1", "document", evaluate_table_1,
-            {"declare_symmetry": False}, "no inertial parameter is declared absent", (),
+            {"declare_symmetry": False},
+            "no inertial parameter and no viscous friction of passive hinges is declared absent", (),
         ),
         Claim(
             "regrouping rules",

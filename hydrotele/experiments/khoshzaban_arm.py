@@ -497,8 +497,8 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
                                     for link in SIMULATED_STAGES) for case in totals]  # fmt: skip
     return Evaluation(
         tuple(checks),
-        "the solver reduces its truncation of singular values in four steps, each of which needs at"
-        " least one iteration, so that any data need about 8 iterations per link",
+        "the solver omits small singular values with four decreasing thresholds and iterates at"
+        " each of them until it converges; with drift alone a link already needs 8 iterations or more",
         f"links 3, 2 and 1: {'; '.join(words)}",
     )
 

@@ -148,7 +148,8 @@ def evaluate_printed_end_point_errors(samples: Sequence[Sample]) -> Evaluation:
                 f"{end}'s end, Table {table}, from the {side} side",
                 samples[0].values[f"{model}.{side}.{end}"],
                 (0.7 * published, 1.3 * published) if published else (0.0, 0.0005),
-                "30 %: the thesis' own poses have the same ranges" if published
+                "30 %: a limit of this project, because the thesis' poses are unknown except for their ranges"
+                if published
                 else "printed as 0.000", unit="m", published=published,
             ))  # fmt: skip
     return Evaluation(

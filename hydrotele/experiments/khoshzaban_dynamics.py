@@ -145,8 +145,8 @@ def evaluate_factor_between_forces(samples: Sequence[Sample]) -> Evaluation:
         "Table 13's cylinders of 200 kg each are too light compared with links of 1830 and 688 kg:"
         " the boom's force reaches a factor of two with cylinders eight times as heavy (2.05),"
         " the swing's torque with ten times (1.99), the stick's force with twice (2.2). Rods whose"
-        " centres of mass lie beyond their pins, as the sign of m c_x suggests, give 1.35. The factor"
-        " exceeds two only when the stick's force is small.",
+        " centres of mass lie beyond their pins, as the sign of m c_x suggests, give 1.35. The"
+        " factor exceeds two only at instants with less than half of the drive's peak force.",
         note=f"RMS difference over RMS force: {relative}; factor of two: {twice}",
     )
 

@@ -267,7 +267,8 @@ def evaluate_force_accuracy(samples: Sequence[Sample]) -> Evaluation:
         tuple(
             check_deterministic_value(f"largest error, {drive}", samples[0].values[drive],
                         (limit - 50.0, 1.001 * (limit + 50.0)), unit=unit, published=limit,
-                        reason="printed to hundreds, with a pound-force that is 0.1 % too small")
+                        reason="printed to hundreds: within 50; up to 0.1 % more, because the document's"
+                        " pound-force is 0.1 % too small")
             for drive, limit, unit in zip(DRIVES, SENSOR_ACCURACY, UNITS, strict=True)
         )
     )  # fmt: skip

@@ -297,6 +297,10 @@ def _evaluate_feedback_limits(samples: Sequence[Sample]) -> Evaluation:
         factor = np.maximum(limits / limits[0], limits[0] / limits)
         order = np.argsort(-factor)[:3]
         explanation = "the limit depends most on " + ", ".join(f"{words[k]} ({factor[k]:.1f} times)" for k in order)
+        explanation += (
+            ". The force is estimated with two filters: that of the force has the frequency in parentheses, that of"
+            " the motion twice this frequency; the force delay is that of both"
+        )
     return Evaluation(checks, explanation, note)
 
 

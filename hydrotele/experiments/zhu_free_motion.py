@@ -217,7 +217,9 @@ def _evaluate_rate_and_position_control(samples: Sequence[Sample]) -> Evaluation
 
     explanation = (
         f"smooth: overshoot below {100 * _MAX_OVERSHOOT:.0f} % and fewer than {_MIN_REVERSALS}"
-        " reversals. Rate control is not smooth for most operators, because they estimate the"
+        f" reversals; oscillates: {_MIN_REVERSALS} reversals or more. A reversal is a change from more than"
+        f" {100 * _MIN_COUNTED_ERROR:.0f} cm on one side of the goal to more than that on the other."
+        " Rate control is not smooth for most operators, because they estimate the"
         " machine's gain and lag while they steer. Position control without tremor:"
         f" {describe_case('calm')}; with a machine five times as fast: {describe_case('fast')}."
         f" Operators with a crossover of 1.5 rad/s: rate {describe_case('slow_rate')}, position"

@@ -290,7 +290,8 @@ TABLE_COMPARISON = Experiment(
     "tables", measure_tables,
     tuple(
         Claim(row, words, item, "input", partial(_evaluate_table, row), {"factor": "1.1"},
-              "the parameters of the models are 10 % larger")
+              "the parameters of the models are 10 % larger; for a zero or a small entry this is less than half"
+              " of the last printed digit")
         for row, (item, words, _) in _TABLE_ROWS.items()
     ),
     fixed_repetitions=1,

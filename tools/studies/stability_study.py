@@ -195,7 +195,7 @@ def robust_table(period: float = 0.005, pairs: int = 100) -> list[str]:
 
 
 def spring_table() -> list[str]:
-    """Stiffness feedback with the published gains, z and rotation about y."""
+    """Stiffness feedback with the published gains, along x, y and z."""
     stick = load_joystick()
     lines = ["| gains | axis | handle | B [N s/m] | M [kg] | K_min [N/m] | K_max [N/m] |"
              " B^2 - 4 M K_max | B required by the theorem | worst growth per half swing |"
@@ -271,20 +271,23 @@ def main() -> None:
         "tasks up to three times softer or stiffer. Master alone: unstable poles of the released "
         "master without the slave's channel (Zhu 1994, 3.71 and 3.72). "
         "Llewellyn: minimum of the stability parameter; the structure is absolutely stable from "
-        "1 on (higher is better). `hydrotele analyse teleop --robust` prints this table.",
+        "1 on (higher is better). Z-width: log10 of the impedance that the hand feels with the slave clamped over that "
+        "in free motion, averaged over the frequencies (higher is better; Colgate and Brown 1994). `hydrotele analyse teleop --robust --operators 100` gives these results; without "
+        "`--operators` it uses 20 random operators.",
         "", *robust_table(), "", "The same at 1 kHz. Master alone, Llewellyn and "
         "Z-width are those of the loop in continuous time and do not depend on the rate:", "", *robust_table(0.001),
         "", "## Stiffness feedback with the published gains (Zhu 1994, Tables 6.7 and 6.9)", "",
         "Theorem 4-2 requires K_min > 0 and B^2 > 4 M K_max (mass M, damping B and bounds K_min and K_max "
-        "of the stiffness of joystick and hand). No published axis meets the second "
-        "condition. The worst switching between K_min and K_max still decays, at any time and "
+        "of the stiffness of joystick and hand). No published translational axis (x, y, z) meets the second "
+        "condition. The rotations are not examined. The worst switching between K_min and K_max still decays, at any "
+        "time and "
         "for any cause: the damping exceeds the value at which one half swing is as large as the "
         "last. Growth below 1 decays (lower is better).",
         "", *spring_table(), "", "## Limits", "",
         "- Wave variables with the slave's damping as wave impedance are unstable at 200 Hz with "
         "the handle released, because the flotor is light: wave impedance times sampling period over "
         "mass of the flotor is 2.4. At 1 kHz they are stable.",
-        "- No published axis meets the sufficient condition of Theorem 4-2.",
+        "- No published translational axis meets the sufficient condition of Theorem 4-2. Rotations are not examined.",
         "- The switching bound holds for the assumed masses of flotor and hand "
         "(models/joystick). Twice the mass raises the required damping by a factor of 1.41.",
         "- Passivity control may leave a bounded motion, which counts as stable.",

@@ -33,12 +33,16 @@ def main() -> None:
     lines = [
         f"# Broken runs of {arguments.name}", "",
         f"`python tools/validation/break_experiments.py {arguments.name}`", "",
-        f"Each row of the [comparison]({_PAGES.get(arguments.name, arguments.name)}.md) is repeated with a planted"
-        " fault, up to six times. Its criterion works if the verdict is *differs*. For a row that differs",
-        "without the fault as well, the run only shows that the fault does not make it agree. `inf`: no limit, or the"
-        " numbers of parameters differ. `nan`, or a",
-        "very large number of standard deviations: with the fault the repetitions have no scatter, or the ratio is not"
-        " defined.", "",
+        f"Rows of the [comparison]({_PAGES.get(arguments.name, arguments.name)}.md) are repeated with a planted"
+        " fault, up to six times. A criterion works if the verdict is *differs*. For a row that differs",
+        "without the fault as well, the run only shows that the fault does not make it agree. Names and fixed texts in"
+        " the third column are those of the row",
+        "without the fault; where they contradict the fault, the fault applies.", "",
+        "`inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
+        " not exist in a repetition, or cannot be",
+        "defined because the repetitions have no scatter. A very large number: the scatter or the denominator is"
+        " almost zero with the fault, or an estimate",
+        "diverges in single repetitions.", "",
         "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
     ]  # fmt: skip
     for claim, row in judged:
@@ -49,6 +53,9 @@ def main() -> None:
     unbroken = [name for name, claim in series.claims.items() if claim.fault is None]
     if unbroken and not names:
         lines += [f"No fault was planted for these rows: {', '.join(unbroken)}.", ""]
+    unavailable = [row.name for row in series.unavailable]
+    if unavailable and not names:
+        lines += [f"These rows cannot be computed and have no criterion: {', '.join(unavailable)}.", ""]
     text = "\n".join(lines)
     print(text)
     if arguments.out:
