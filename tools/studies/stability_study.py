@@ -272,8 +272,9 @@ def main() -> None:
         "master without the slave's channel (Zhu 1994, 3.71 and 3.72). "
         "Llewellyn: minimum of the stability parameter; the structure is absolutely stable from "
         "1 on (higher is better). Z-width: log10 of the impedance that the hand feels with the slave clamped over that "
-        "in free motion, averaged over the frequencies (higher is better; Colgate and Brown 1994). `hydrotele analyse teleop --robust --operators 100` gives these results; without "
-        "`--operators` it uses 20 random operators.",
+        "in free motion, averaged over the frequencies (higher is better; Colgate and Brown 1994). "
+        "`hydrotele analyse teleop --robust --operators 100` gives these results; without `--operators` it"
+        " uses 20 random operators.",
         "", *robust_table(), "", "The same at 1 kHz. Master alone, Llewellyn and "
         "Z-width are those of the loop in continuous time and do not depend on the rate:", "", *robust_table(0.001),
         "", "## Stiffness feedback with the published gains (Zhu 1994, Tables 6.7 and 6.9)", "",
