@@ -96,6 +96,7 @@ def arm_impedance(arm: ArmParameters, hand_position: tuple[float, float]) -> tup
 
     Source: Hogan 1985 (impedance in other coordinates); Mussa-Ivaldi, Hogan and Bizzi 1985.
 
+    >>> from hydrotele.teleop.operator_parameters import load_operator_file
     >>> file = load_operator_file()
     >>> assert file.arm
     >>> arm_impedance(file.arm, (0.4, 0.0))[1].round().tolist()
