@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from hydrotele.effects import locate_error_in_effect_file
 from hydrotele.effects.effect import with_value
+from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
@@ -239,7 +240,7 @@ class _Judge:
         found = judged.tracks[0].levels
         self.data, self.ripple = data, rippled(found)
         drift = found.drift if self.ripple else {}
-        self.levels = Levels(found.noise, drift=drift, jitter=found.jitter)
+        self.levels = Levels(found.noise, drift=drift, jitter=found.jitter, colours=found.colours)
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
@@ -260,13 +261,15 @@ class _Judge:
 
         A floor is refused where the perfect machine's own runs cannot be followed: they left the
         model's range, or the filter does not hold them. With process noise (ripple, contact, what
-        the rows are too slow for) it is that noise that the floor counts, by definition 1.
+        the rows are too slow for) or coloured noise of sensors it is that noise that the floor counts,
+        by definition 1.
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
-        perfect = () if self.ripple else perfect_tracks(machine, noisy, tracks, evidence.map)
-        floor = 1.0 if self.ripple else rms(perfect[:1])
+        known = self.ripple or bool(self.levels.colours)
+        perfect = () if known else perfect_tracks(machine, noisy, tracks, evidence.map)
+        floor = 1.0 if known else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
-        clean = holds and not self.ripple
+        clean = holds and not known
         tests = residual_tests(tracks, self.data.channels, perfect if clean else ())
         if clean and has_sizes(judged.guess):
             made = Evidence(noisy, [track.run for track in perfect[1:]], 1, evidence.step)
@@ -623,7 +626,7 @@ def _far(guess: Guess) -> list[str]:
 def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
     return {
         channel: (float(found), float(stated))
-        for channel, found, stated in zip(data.channels, levels.noise, data.noise, strict=True)
+        for channel, found, stated in zip(data.channels, levels.whole_noise, data.noise, strict=True)
     }
 
 
@@ -664,15 +667,26 @@ def _jitter(data: Dataset, levels: Levels) -> tuple[float, float]:
     return (found if abs(found - stated) > _JITTER * max(found, stated) else stated), stated
 
 
+def _colour_words(channel: str, colour: Colour, white: float) -> str:
+    """Describe the coloured noise of a channel."""
+    share = colour.size**2 / (colour.size**2 + white**2)
+    kind = f"with a resonance at {colour.frequency:.3g} Hz" if colour.frequency else "of first order"
+    return (
+        f"{100.0 * share:.0f} % of the noise variance of {channel} is coloured, {kind}"
+        f" (correlation time {colour.memory:.2g} s)."
+    )
+
+
 def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
     notes = []
-    ratio = levels.noise / data.noise
+    ratio = levels.whole_noise / data.noise
     off = [
         f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
         if np.isfinite(r) and abs(r - 1.0) > _OFF
     ]  # fmt: skip
     if off:
         notes.append(f"The noise differs from the machine file: {', '.join(off)}.")
+    notes += [_colour_words(data.channels[c.channel], c, levels.noise[c.channel]) for c in levels.colours]
     jitter, stated = _jitter(data, levels)
     if not jitter and stated:
         notes.append(f"The data show no sampling jitter; the machine file states {1e3 * stated:.3g} ms.")
