@@ -113,7 +113,7 @@ def measure_spectrum(found: np.ndarray, expected: np.ndarray, period: float) -> 
     """
     rows = min(_SEGMENT, len(found))
     spectra = [
-        welch(values, 1.0, nperseg=rows, axis=0, detrend=False, return_onesided=False)[1]
+        welch(values, 1.0, nperseg=rows, axis=0, return_onesided=False)[1]
         for values in (found, expected)
     ]
     half = slice(1, (rows + 1) // 2)  # without the mean: it is an offset

@@ -586,7 +586,7 @@ class Crossing(NamedTuple):
 
 
 @compiled
-def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, colours, out):
+def filter_run(model, sp, late, z, covariance, rows, variances, lines, extra, out):
     """Cross a run.
 
     Args:
@@ -599,8 +599,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, c
         rows: MeasuredRun.
         variances: Variances.
         lines: (Steps, Linearisation).
-        inputs: InputEffect.
-        colours: ColouredNoise.
+        extra: (InputEffect, ColouredNoise).
         out: Crossing, written.
 
     Returns:
@@ -613,8 +612,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, c
     noise, drift, unknown = variances
     (steps, coarse, nudge), (fresh, given, own, gains, initial, flow) = lines
     slope, gain, width = gains
-    columns, decay = inputs
-    shown, turn = colours
+    (columns, decay), (shown, turn) = extra
     tints = len(shown)
     whitened, predicted, corrected = out
     count, channels, full = reading.shape[0], reading.shape[1], len(z)

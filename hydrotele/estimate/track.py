@@ -681,7 +681,7 @@ def _cross(
         model, space, late, state, covariance,
         MeasuredRun(run.command, run.command_known, run.reading, run.period), variances,
         (steps, lines),
-        InputEffect(columns, decay(run.period)), ColouredNoise(*join_transitions(levels.colours, run.period)),
+        (InputEffect(columns, decay(run.period)), ColouredNoise(*join_transitions(levels.colours, run.period))),
         Crossing(whitened, predicted, states),
     )  # fmt: skip
     return Track(
