@@ -98,7 +98,7 @@ class Spectrum:
 
 
 _SEGMENT = 128  # rows of a spectrum's segments: 2.6 s at 50 Hz, and resonances are resolved to 0.4 Hz
-_LEAST_WHITE = 1.0e-3  # share of a white variance that remains beside a coloured one
+_LEAST_WHITE = 1.0e-3  # smallest share of the white variance that remains
 _STARTS = ((0.02, 0.0), (0.2, 0.0), (2.0, 0.0), (0.1, 0.15), (0.1, 0.3), (0.1, 0.45))
 # Correlation times [s] and frequencies [1 per row] from which the best ones are looked for.
 
@@ -112,10 +112,7 @@ def measure_spectrum(found: np.ndarray, expected: np.ndarray, period: float) -> 
         period: of the rows [s].
     """
     rows = min(_SEGMENT, len(found))
-    spectra = [
-        welch(values, 1.0, nperseg=rows, axis=0, return_onesided=False)[1]
-        for values in (found, expected)
-    ]
+    spectra = [welch(values, 1.0, nperseg=rows, axis=0, return_onesided=False)[1] for values in (found, expected)]
     half = slice(1, (rows + 1) // 2)  # without the mean: it is an offset
     angles = 2.0 * np.pi * np.arange(rows)[half] / rows
     return Spectrum(period, angles, spectra[0][half], spectra[1][half], len(found) / rows)
@@ -131,7 +128,7 @@ def find_colour(spectra: Sequence[Spectrum], channel: int, white: float, largest
         largest: standard deviation that the coloured part can have.
 
     Returns:
-        The coloured part, the standard deviation of the white part beside it, and twice the log likelihood that both
+        The coloured part, the standard deviation of the remaining white part, and twice the log likelihood that both
         bring. A resonance must bring twice the log of the number of readings more than a first-order part.
 
     Source: likelihood of Whittle 1953; a noise of covariance C added to a channel changes the spectrum D of its

@@ -560,7 +560,7 @@ class InputEffect(NamedTuple):
 
 
 class ColouredNoise(NamedTuple):
-    """Coloured noise of readings, k states between the readings on their way and the unknown inputs.
+    """Coloured noise of readings, k states between the late readings and the residual inputs.
 
     Attributes:
         channel: (k,) channel to which a state is added, -1 for none.
@@ -593,7 +593,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, extra, ou
         model: Model.
         sp: Space.
         late: DelayedReadings; its q readings follow the model's states, and are set here at first;
-            k states of coloured noise and m unknown inputs are the last of the nz states.
+            k states of coloured noise and m residual inputs are the last of the nz states.
         z: (nz,) state before the first row's readings; overwritten.
         covariance: (nz, nz) its covariance; overwritten.
         rows: MeasuredRun.

@@ -335,7 +335,7 @@ _QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: rea
 # less than they do are no sensor, but a lack that is faster than the unknown inputs
 _QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most of it
 _FAINT = 0.1  # of the white noise: a coloured part below it, 1 % of the variance, does not show
-_WHITE_LEFT = 0.03  # of a channel's noise, that is white beside a coloured part: rounding at least
+_WHITE_LEFT = 0.03  # of a channel's noise with a coloured part, that is white: rounding at least
 _LEAST_JITTER, _MOST_JITTER = 1.0e-3, 0.5  # of a period; less does not show, more is no clock
 _BEGUN_JITTER = 0.03  # of a period, from which jitter is sought
 _JITTERS = 30.0  # twice the log likelihood that it must bring
@@ -803,7 +803,7 @@ def largest_colours(prior: Prior) -> np.ndarray:
     return prior.noise * np.exp(2.0 * prior.width)
 
 
-def propose_colours(data: Dataset, tracks: Sequence[Track], wanted: float, seed: int = 0) -> Levels | None:
+def propose_colours(data: Dataset, tracks: Sequence[Track], min_gain: float, seed: int = 0) -> Levels | None:
     """Propose the coloured noise that the readings of a model show.
 
     The smoothed noise of a right model has the spectrum that the model's own readings have; these are simulated once.
@@ -811,11 +811,11 @@ def propose_colours(data: Dataset, tracks: Sequence[Track], wanted: float, seed:
     Args:
         data: the dataset.
         tracks: of the model, linearised.
-        wanted: twice the log likelihood that the coloured noise of a channel must bring.
+        min_gain: twice the log likelihood that the coloured noise of a channel must bring.
         seed: of the simulated readings.
 
     Returns:
-        The levels with coloured noise of the channels that want it; None if none does that had none before.
+        The levels with coloured noise of the channels that want it; None if no further channel has any.
     """
     levels, rng = tracks[0].levels, np.random.default_rng(seed)
     taken = {colour.channel for colour in levels.colours}
@@ -825,7 +825,7 @@ def propose_colours(data: Dataset, tracks: Sequence[Track], wanted: float, seed:
         if c in taken or not noise[c] < largest[c]:
             continue
         colour, white, gain = find_colour(spectra, c, noise[c] ** 2, largest[c])
-        if gain > wanted:
+        if gain > min_gain:
             noise[c] = white
             colours.append(colour)
     if len(colours) == len(taken):
