@@ -12,22 +12,10 @@ from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.levels import propose_colours
 from hydrotele.estimate.track import Levels, track_run
 from hydrotele.machine.machine_file import load_machine
-from tests.small_machines import simulate_data
+from tests.small_machines import add_coloured_noise, simulate_colour, simulate_data
 
 PERIOD = 0.02  # s
 RESONANT, SLOW = Colour(0, 2.0, 0.15, 11.0), Colour(0, 2.0, 0.2)
-
-
-def simulate_colour(colour, rows, seed):
-    """Return coloured noise (rows,) of a standard deviation of 1."""
-    rng = np.random.default_rng(seed)
-    flow = colour.transition(PERIOD)
-    state, values = rng.standard_normal(colour.states), np.empty(rows)
-    for row in range(rows):
-        values[row] = state[0]
-        noise = rng.standard_normal(colour.states)
-        state = flow @ state + np.sqrt(1.0 - colour.decay(PERIOD) ** 2) * noise
-    return values
 
 
 @pytest.mark.parametrize("colour", [RESONANT, SLOW])
@@ -52,7 +40,7 @@ def test_states_of_coloured_noise_keep_their_variance():
 def test_a_coloured_part_is_found_beside_a_white_one(colour):
     """Of 4000 readings of a sensor that shows a known value, half of whose variance is coloured."""
     rng, white = np.random.default_rng(1), 3.0
-    noise = np.sqrt(0.5 * white) * (simulate_colour(colour, 4000, 2) + rng.standard_normal(4000))
+    noise = np.sqrt(0.5 * white) * (simulate_colour(colour, PERIOD, 4000, 2) + rng.standard_normal(4000))
     spectra = measure_spectrum(noise[:, None] / white, rng.standard_normal((4000, 1)) / np.sqrt(white), PERIOD)
     found, left, gain = find_colour([spectra], 0, white, 10.0)
     assert gain > 100.0  # 4000 readings whose spectrum differs by a factor of 2 and more in a tenth of the band
@@ -77,11 +65,7 @@ def rig():
     noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
     channels = ("position.slide", "pressure_head.slide", "pressure_rod.slide")
     data = simulate_data(load_machine("rig"), channels, noise, period=0.005, rows=1000, noise_stated=True)
-    (run,), colour = data.fit, Colour(1, 1e4, 0.04, 60.0)
-    slower = dataclasses.replace(colour, memory=colour.memory * PERIOD / 0.005, frequency=15.0)
-    reading = run.reading.copy()
-    reading[:, 1] += 2e4 * simulate_colour(slower, len(reading), 3)  # the same per row
-    return dataclasses.replace(data, fit=(dataclasses.replace(run, reading=reading),))
+    return add_coloured_noise(data, {"pressure_head.slide": Colour(1, 2e4, 0.04, 60.0)}, seed=3)
 
 
 def test_the_filter_whitens_coloured_noise(rig):
