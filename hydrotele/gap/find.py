@@ -24,6 +24,7 @@ from hydrotele.gap.calibrating import (
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import search_model
 from hydrotele.gap.profiles import find_profiles, profile_words
@@ -95,6 +96,7 @@ def find_gap(
     jobs: int = 2,
     keep: Callable[[Interim], None] | None = None,
     method: Method = "search",
+    warn: Callable[[str], None] = lambda text: None,
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -106,6 +108,7 @@ def find_gap(
         jobs: processors that it may use.
         keep: called with the best answer so far, each time that there is a better one.
         method: `search`, or `regression` of `gap.model_search`.
+        warn: called with one sentence per gross error of the logs, before the search.
 
     Returns:
         The gap, named or not.
@@ -128,6 +131,12 @@ def find_gap(
             raise own
         notes.append(f"Not tried: {error}.")
     data = downsample(select_exciting_segments(data))
+    tell("run initial regressions", 0.0)
+    initial = run_initial_regressions(data)
+    for gross in initial.errors:
+        warn(gross.description)
+    if method == "regression":
+        candidates = with_start_values(candidates, initial)
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     if keep:
         evidence.keep = keep_better(data.machine, keep, begin)
@@ -227,7 +236,8 @@ def find_gap(
         notes=(*data.notes, *notes, *map(detail_words, details), *method_notes,
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
-        answers=tuple(answer_document(named)) if method == "regression" else None,
+        answers=tuple(answer_document(named)),
+        initial=initial,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
