@@ -24,6 +24,7 @@ from hydrotele.gap.calibrating import (
 from hydrotele.gap.description import describe, learned_laws
 from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import search_model
@@ -44,6 +45,7 @@ from hydrotele.gap.result import (
     Alternative,
     Candidate,
     Estimate,
+    Explanation,
     Gap,
     GapSize,
     Lack,
@@ -180,6 +182,7 @@ def find_gap(
         if method == "regression":
             method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
+        traces = trace_inputs(evidence.data, found.base, discovery.judged)
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
@@ -238,6 +241,11 @@ def find_gap(
         unused_channels=data.unused_channels,
         answers=tuple(answer_document(named)),
         initial=initial,
+        explanation=Explanation(
+            compare_contenders(found, named),
+            list_rejections(found, named, details, _MINOR, [n for n in notes if "rejected" in n]),
+            traces,
+        ),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
