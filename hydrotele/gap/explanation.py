@@ -21,6 +21,7 @@ from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 
 _TRACES = 4  # residual inputs that are shown: those that are the largest part of their physical limit
+_MIN_RELATIVE = 0.02  # of the largest: smaller residual inputs say nothing about the verdict
 _RIDGE = 1e-6  # of the squared change per row of an input at its estimated size: keeps the equations solvable
 
 
@@ -105,7 +106,7 @@ def trace_inputs(data: Dataset, given: Judged, final: Judged) -> tuple[InputTrac
     if not levels.inputs:
         return ()
     parts = levels.sizes / input_sizes(data.machine, levels.inputs)
-    chosen = np.argsort(-parts)[:_TRACES]
+    chosen = [k for k in np.argsort(-parts)[:_TRACES] if parts[k] > _MIN_RELATIVE * parts.max()]
     seen = [see(data, given, track) for track in given.tracks]
     lead = levels.inputs[int(chosen[0])]
     index = int(np.argmax([np.mean(np.where(s.known, s.inputs[lead], 0.0) ** 2) for s in seen]))

@@ -21,8 +21,8 @@ from hydrotele.gap.calibrating import (
     calibrate_freely,
     fit_until_settled,
 )
-from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
+from hydrotele.gap.description import describe, effect_title, learned_laws
+from hydrotele.gap.discover import LEARNED, Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
@@ -45,7 +45,6 @@ from hydrotele.gap.result import (
     Alternative,
     Candidate,
     Estimate,
-    Explanation,
     Gap,
     GapSize,
     Lack,
@@ -54,6 +53,7 @@ from hydrotele.gap.result import (
     NamedEffect,
     Prediction,
     Verdict,
+    VerdictExplanation,
 )
 from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
@@ -121,9 +121,9 @@ def find_gap(
     """
     find = search_model if method == "regression" else search
     begin = time.perf_counter()
-    tell = progress or (lambda text, share: None)
+    report = progress or (lambda text, share: None)
     given, notes = data.machine, []
-    opened = None if effects else calibrate_freely(data, jobs, lambda text: tell(text, 0.0))
+    opened = None if effects else calibrate_freely(data, jobs, lambda text: report(text, 0.0))
     if opened:
         data = dataclasses.replace(data, machine=opened.machine)
         notes.append(opened.note)
@@ -133,23 +133,33 @@ def find_gap(
             raise own
         notes.append(f"Not tried: {error}.")
     data = downsample(select_exciting_segments(data))
-    tell("run initial regressions", 0.0)
+    report("run initial regressions", 0.0)
     initial = run_initial_regressions(data)
     for gross in initial.errors:
         warn(gross.description)
     if method == "regression":
         candidates = with_start_values(candidates, initial)
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
-    if keep:
-        evidence.keep = keep_better(data.machine, keep, begin)
+    interim = keep_better(data.machine, keep, begin) if keep else lambda judged: None
+    leader = ""
+
+    def keep_best(judged: Judged) -> None:
+        nonlocal leader
+        leader = best_words(judged.guess)
+        interim(judged)
+
+    def tell(text: str, share: float) -> None:
+        report(f"{text}; best so far: {leader}" if leader else text, share)
+
+    evidence.keep = keep_best
     try:
-        found = find(evidence, candidates, progress)
+        found = find(evidence, candidates, tell)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
                 notes.append(_REJECTED.format(worse))
                 found = found.emptied()
-                evidence.set_base(found.base)
+                keep_best(evidence.set_base(found.base))
             tell("learn laws of the unexplained difference", 0.93)
             found, discovery = _learned(evidence, found)
             evidence.keep(discovery.judged)
@@ -241,13 +251,30 @@ def find_gap(
         unused_channels=data.unused_channels,
         answers=tuple(answer_document(named)),
         initial=initial,
-        explanation=Explanation(
+        explanation=VerdictExplanation(
             compare_contenders(found, named),
             list_rejections(found, named, details, _MINOR, [n for n in notes if "rejected" in n]),
             traces,
         ),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def best_words(guess: Guess) -> str:
+    """Name what a hypothesis consists of, for a progress display; empty for the given machine.
+
+    >>> best_words(Guess(((Hypothesis("payload", "tool", {}), np.zeros(0)),)))
+    'payload at the tool'
+    """
+    words = []
+    for hypothesis in guess.hypotheses:
+        if hypothesis.name == CALIBRATION:
+            words.append("calibrated parameters")
+        elif hypothesis.name.startswith(LEARNED):
+            words.append("a learned law")
+        else:
+            words.append(effect_title(Alternative(*hypothesis.key, 0.0)))
+    return " and ".join(dict.fromkeys(words))
 
 
 class _Judge:

@@ -413,6 +413,8 @@ class _Problem:
         for channel in self.used[key]:
             if channel in signals.reading:
                 known &= np.isfinite(signals.reading[channel])
+        ends = math.ceil(1.0 / (BAND * signals.period))  # where the filters have their transients
+        known[:ends], known[-ends:] = False, False
         cylinder = self.machine.axes[key[1]].cylinder
         if cylinder:
             margin = END_MARGIN * cylinder.stroke

@@ -126,18 +126,19 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     given = Model(settle_noise(evidence, evidence.judged(Guess())))
+    evidence.keep(given.judged)
     candidates = timed([c for c in candidates if c.name not in _EXCLUDED], given.judged)
     now, first = given, tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
     for index in range(_MAX_EFFECTS):
         share = 0.05 + 0.8 * index / _MAX_EFFECTS
-        tell(f"compare effects{_words(now)}", share)
+        tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
         proposals = propose(evidence, now, pool)
         first = first or tuple(proposals)
         keys = keys or {p.key for p in proposals[:_KEPT]}
-        tell(f"refine the best effects{_words(now)}", share + 0.03)
+        tell("refine the best effects", share + 0.03)
         models = extensions(evidence, now, proposals)
         better = min(models, key=lambda m: m.score + MIN_LOG_BAYES_FACTOR * len(m.guess.parts), default=now)
         if better is now or now.score - better.score < MIN_LOG_BAYES_FACTOR * (
@@ -147,6 +148,7 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         settled = settle(evidence, better)
         rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
         now = settled
+        evidence.keep(now.judged)
     tell("remove unnecessary effects", 0.87)
     now, rests = remove_needless(evidence, given, now, rounds)
     tell("compare alternative effects", 0.9)
@@ -183,11 +185,6 @@ def settle(evidence: Evidence, model: Model) -> Model:
         return Model(settle_noise(evidence, model.judged))
     judged, fit = fit_until_settled(evidence, model.judged)
     return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
-
-
-def _words(model: Model) -> str:
-    names = ", ".join(f"{h.name} {h.location}" for h in model.guess.hypotheses)
-    return f" beside {names}" if names else ""
 
 
 # -- linear step ------------------------------------------------------------------------------------------------------

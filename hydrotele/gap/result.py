@@ -334,7 +334,7 @@ class InputTrace:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class VerdictExplanation:
     """Why the verdict: candidates, rejections, and residual inputs over time."""
 
     comparisons: tuple[Comparison, ...] = ()
@@ -426,7 +426,7 @@ class Gap(Generic[Model]):
     unused_channels: tuple[str, ...] = ()
     answers: tuple[Mapping[str, Any], ...] | None = None
     initial: InitialRegressions | None = None
-    explanation: Explanation | None = None
+    explanation: VerdictExplanation | None = None
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -539,7 +539,7 @@ def regressions_document(found: InitialRegressions) -> dict:
     return {"errors": errors, "regressions": regressions}
 
 
-def explanation_document(why: Explanation) -> dict[str, Any]:
+def explanation_document(why: VerdictExplanation) -> dict[str, Any]:
     """Return an explanation as plain data for `gap.json`.
 
     Returns:

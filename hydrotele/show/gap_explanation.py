@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hydrotele.core.units import plot_axis_unit
-from hydrotele.gap.answer import family_of
 from hydrotele.gap.description import effect_title, failed_tests, lack_title, probability_text, share_words
 from hydrotele.gap.result import (
     SURE,
@@ -182,10 +181,10 @@ def _draw(axes: "Axes", x, measured, line, given, fitted) -> None:
     if given is not None:
         axes.plot(line, given, color=NOMINAL_COLOUR, lw=1.8, label="given model")
     axes.plot(line, fitted, color=FITTED_COLOUR, lw=1.4, ls="--", label="fitted")
-    low, high = np.quantile(measured, [0.005, 0.995])
+    low, high = np.quantile(measured, [0.02, 0.98])
     curves = [fitted] if given is None else [fitted, given]
     low, high = min(low, *(c.min() for c in curves)), max(high, *(c.max() for c in curves))
-    room = 0.08 * (high - low) or 1.0
+    room = 0.15 * (high - low) or 1.0
     axes.set_ylim(low - room, high + room)
 
 
@@ -214,12 +213,10 @@ def verdict_reasons(gap: Gap) -> list[str]:
     for comparison in gap.explanation.comparisons if gap.explanation else ():
         own = next(c for c in comparison.contenders if (c.name, c.location) == (comparison.name, comparison.location))
         others = [c for c in comparison.contenders if c is not own]
-        text = (
-            f"{_title(own)} is supported with twice the log Bayes factor {own.log_bayes_factor:,.0f} against no effect"
-        )
+        text = f"Twice the log Bayes factor of {_title(own)} against no effect is {own.log_bayes_factor:,.0f}"
         if others:
-            text += f"; the best other candidate, {_title(others[0])}, reaches {others[0].log_bayes_factor:,.0f}"
-        texts.append(f"{text[0].upper()}{text[1:]}.")
+            text += f"; that of the best other candidate, {_title(others[0])}, is {others[0].log_bayes_factor:,.0f}"
+        texts.append(f"{text}.")
     for effect in gap.effects:
         if effect.mechanism_probability < SURE:
             texts.append(

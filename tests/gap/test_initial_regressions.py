@@ -57,8 +57,10 @@ def simulate_cylinder(coulomb: float = 150.0, viscous: float = 600.0, gain: floa
         head += STEP * beta / (dead + area_head * x) * (q_head - area_head * v)
         rod += STEP * beta / (dead + area_rod * (stroke - x)) * (area_rod * v - q_rod)
     command, position, head, rod = np.array(table).T
-    columns = {"command.slide": command, "position.slide": position, "length.slide": position.copy(),
-               "pressure_head.slide": head, "pressure_rod.slide": rod, "pressure_supply": np.full(len(head), supply)}  # fmt: skip
+    columns = {
+        "command.slide": command, "position.slide": position, "length.slide": position.copy(),
+        "pressure_head.slide": head, "pressure_rod.slide": rod, "pressure_supply": np.full(len(head), supply),
+    }  # fmt: skip
     rng = np.random.default_rng(3)
     return {c: v + NOISE.get(c, 0.0) * rng.normal(size=len(v)) for c, v in columns.items()}
 
