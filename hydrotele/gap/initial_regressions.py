@@ -311,7 +311,7 @@ class _Problem:
                 found[key] = rows
         return found
 
-    def needed(self, reading: Reading) -> list[np.ndarray | None]:
+    def needed_forces(self, reading: Reading) -> list[np.ndarray | None]:
         """Per run (n, nu) force of every drive that the motion needs, without friction; None if unknown."""
         mark = tuple(sorted((c, m) for c, m in reading.moves.items() if c.startswith(("angle", "position", "length"))))
         if mark not in self._needed:
@@ -370,7 +370,7 @@ class _Problem:
         nominal, names, low = True, ("factor", "constant"), np.array([0.0, -np.inf])
         one = np.ones(len(position))
         if balance == "force":
-            push, needed = _push(machine, signals, axis), self.needed(reading)[run]
+            push, needed = _push(machine, signals, axis), self.needed_forces(reading)[run]
             if push is None or needed is None or axis in machine.loads:
                 return None
             measured = np.atleast_2d(push)[0]
@@ -686,7 +686,9 @@ def find_wrong_reading(problem: _Problem, now: Reading) -> tuple[Reading, GrossE
         for key in base:
             mark = problem.signature(key, reading)
             if mark not in cache:
-                cache[mark] = best_account(account_for(rows[key], count)) if key in rows else _lost(count)
+                cache[mark] = (
+                    best_account(account_for(rows[key], count)) if key in rows else _unexplained_account(count)
+                )
             found[key] = cache[mark]
         return found
 
@@ -716,7 +718,7 @@ def find_wrong_reading(problem: _Problem, now: Reading) -> tuple[Reading, GrossE
     return reading, error
 
 
-def _lost(count: int) -> Account:
+def _unexplained_account(count: int) -> Account:
     """Account of a balance that cannot be computed under a reading, as if nothing explained it."""
     return Account("unexplained", np.zeros(count), _CHARGES["unexplained"], 0.0)
 

@@ -67,7 +67,7 @@ def _regression_rows(one: Regression) -> list[tuple[str, ...]]:
             title = "flow per command"
         s = _plain_texts(estimate)
         first = f"{_BALANCES[one.balance]} of the {one.axis}" if not rows else ""
-        quality = (_explained(one.explained_nominal), _explained(one.explained)) if not rows else ("", "")
+        quality = (_variance_text(one.explained_nominal), _variance_text(one.explained)) if not rows else ("", "")
         rows.append((first, title, *s, *quality))
     return rows
 
@@ -81,7 +81,7 @@ def _plain_texts(estimate: Estimate) -> tuple[str, str, str, str]:
     return s.nominal, s.value, f"{s.low} to {s.high}", s.unit
 
 
-def _explained(fraction: float) -> str:
+def _variance_text(fraction: float) -> str:
     return f"{100.0 * max(fraction, 0.0):.1f} %" if math.isfinite(fraction) else "-"
 
 
