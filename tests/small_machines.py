@@ -5,10 +5,13 @@ Angles, commands, angular rates of the drives and time constants of the valves s
 modulus, so that a small machine is stiff.
 """
 
+import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import steps_per_row
 from hydrotele.hydraulics.actuator_layout import actuator_order
@@ -117,3 +120,36 @@ def simulate_data(
         runs.append(RunData(f"run_{seed}", 0.0, period, command, np.ones(rows, bool), shown, log))
     stated = sizes if noise_stated else np.full(len(channels), np.nan)
     return Dataset(model or truth, axes, channels, stated, tuple(runs[1:]), runs[0], ())
+
+
+def simulate_colour(colour: Colour, period: float, rows: int, seed: int) -> np.ndarray:
+    """Return coloured noise (rows,) of a standard deviation of 1, whatever the size of the colour."""
+    rng, flow = np.random.default_rng(seed), colour.transition(period)
+    state, values = rng.standard_normal(colour.states), np.empty(rows)
+    for row in range(rows):
+        values[row] = state[0]
+        state = flow @ state + np.sqrt(1.0 - colour.decay(period) ** 2) * rng.standard_normal(colour.states)
+    return values
+
+
+def add_coloured_noise(data: Dataset, colours: Mapping[str, Colour], seed: int) -> Dataset:
+    """Add coloured noise to channels of all runs.
+
+    Args:
+        data: the dataset.
+        colours: channel -> noise, whose size counts.
+        seed: of the noise.
+
+    Returns:
+        The dataset with the same stated noise.
+    """
+
+    def add(run: RunData, number: int) -> RunData:
+        reading = run.reading.copy()
+        for k, (channel, colour) in enumerate(colours.items()):
+            own = simulate_colour(colour, run.period, len(reading), seed + 100 * number + k)
+            reading[:, data.channels.index(channel)] += colour.size * own
+        return dataclasses.replace(run, reading=reading)
+
+    fit = tuple(add(run, 1 + k) for k, run in enumerate(data.fit))
+    return dataclasses.replace(data, fit=fit, heldout=add(data.heldout, 0))

@@ -170,10 +170,7 @@ class Evidence:
             machine = guess.machine(self.data.machine)
         except DomainError:
             return Judged(guess, self.tracks, np.inf)
-        tracks = self.map(
-            lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
-            self.tracks,
-        )
+        tracks = tuple(dataclasses.replace(track, levels=levels) for track in self.tracks)
         tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)

@@ -560,6 +560,18 @@ class InputEffect(NamedTuple):
     decay: float
 
 
+class ColouredNoise(NamedTuple):
+    """Coloured noise of readings, k states between the late readings and the residual inputs.
+
+    Attributes:
+        channel: (k,) channel to which a state is added, -1 for none.
+        flow: (k, k) transition of the states over a row.
+    """
+
+    channel: np.ndarray
+    flow: np.ndarray
+
+
 class Crossing(NamedTuple):
     """What a filter writes of a run.
 
@@ -575,20 +587,20 @@ class Crossing(NamedTuple):
 
 
 @compiled
-def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, out):
+def filter_run(model, sp, late, z, covariance, rows, variances, lines, extra, out):
     """Cross a run.
 
     Args:
         model: Model.
         sp: Space.
         late: DelayedReadings; its q readings follow the model's states, and are set here at first;
-            m unknown inputs are the last of the nz states.
+            k states of coloured noise and m residual inputs are the last of the nz states.
         z: (nz,) state before the first row's readings; overwritten.
         covariance: (nz, nz) its covariance; overwritten.
         rows: MeasuredRun.
         variances: Variances.
         lines: (Steps, Linearisation).
-        inputs: InputEffect.
+        extra: (InputEffect, ColouredNoise).
         out: Crossing, written.
 
     Returns:
@@ -601,19 +613,22 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
     noise, drift, unknown = variances
     (steps, coarse, nudge), (fresh, given, own, gains, initial, flow) = lines
     slope, gain, width = gains
-    columns, decay = inputs
+    (columns, decay), (shown, turn) = extra
+    tints = len(shown)
     whitened, predicted, corrected = out
     count, channels, full = reading.shape[0], reading.shape[1], len(z)
     inputs, h, few = columns.shape[1], period / steps, len(own)
     begin = full - inputs  # of the inputs
-    size = begin - len(late.channel)
+    tint = begin - tints  # of the coloured noise
+    size = tint - len(late.channel)
     trail = np.zeros((steps + 1, channels))
     rough = np.zeros((coarse + 1, channels))
-    if size == begin:  # nothing is late
+    if size == tint:  # nothing is late
         trail, rough = trail[:0], rough[:0]
     reached = np.zeros((full + 1, full))
     moved, work = np.zeros(size), np.zeros((full, full))
     delta, pull = np.zeros(few), np.zeros(full)
+    noises = np.zeros(tints)
     place(model, sp, z)
     first = np.int64(0)  # numba compiles a function anew for a written number
     read_channels(model, sp, z, first, steps, h, trail[:0], predicted[0])
@@ -634,6 +649,11 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                     slope[row, c, :] = 0.0
                     slope[row, c, size + late.first[c]] = 1.0
         add_sensor_drift(model, sp.time[1] + row * period, predicted[row])
+        for k in range(tints):
+            if shown[k] >= 0:
+                predicted[row, shown[k]] += z[tint + k]
+                if fresh:
+                    slope[row, shown[k], tint + k] = 1.0
         delta[:] = 0.0
         for c in range(channels):
             if math.isnan(reading[row, c]):
@@ -678,8 +698,11 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
                         for r in range(size):
                             reached[s, r] += nudge[s] * columns[row, s - begin, r]
                         reached[s, s] += decay * nudge[s]
+                    elif tint <= s < begin:
+                        for k in range(tints):
+                            reached[s, tint + k] += nudge[s] * turn[k, s - tint]
                     else:
-                        perturb_delayed(late, s - size, nudge[s], reached[s, size:begin])
+                        perturb_delayed(late, s - size, nudge[s], reached[s, size:tint])
                 for s in range(full):
                     for r in range(full):
                         reached[s, r] = (reached[s, r] - reached[full, r]) / nudge[s]
@@ -697,6 +720,12 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
             for r in range(size):
                 z[r] += columns[row, i, r] * z[begin + i]
             z[begin + i] *= decay
+        for k in range(tints):
+            noises[k] = z[tint + k]
+        for k in range(tints):
+            z[tint + k] = 0.0
+            for s in range(tints):
+                z[tint + k] += turn[k, s] * noises[s]
     return loss
 
 

@@ -26,6 +26,7 @@ from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.estimate.colour import Spectrum, find_colour, measure_spectrum, state_labels
 from hydrotele.estimate.filter import (
     Input,
     decay,
@@ -335,6 +336,8 @@ _NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is 
 _QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: readings that scatter
 # less than they do are no sensor, but a lack that is faster than the unknown inputs
 _QUIETER_UNSTATED = 0.3  # times the rough noise, where fast motion may be most of it
+_FAINT = 0.1  # of the white noise: a coloured part below it, 1 % of the variance, does not show
+_WHITE_LEFT = 0.03  # of a channel's noise with a coloured part, that is white: rounding at least
 _LEAST_JITTER, _MOST_JITTER = 1.0e-3, 0.5  # of a period; less does not show, more is no clock
 _BEGUN_JITTER = 0.03  # of a period, from which jitter is sought
 _JITTERS = 30.0  # twice the log likelihood that it must bring
@@ -655,7 +658,8 @@ def _pruned(levels: Levels, machine: Machine) -> Levels:
     """Levels without the inputs that are none."""
     kept = levels.sizes > 2.0 * LEAST * input_sizes(machine, levels.inputs)
     inputs = tuple(i for i, keep in zip(levels.inputs, kept, strict=True) if keep)
-    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept])
+    colours = tuple(c for c in levels.colours if c.size > _FAINT * levels.noise[c.channel])
+    return dataclasses.replace(levels, inputs=inputs, sizes=levels.sizes[kept], colours=colours)
 
 
 def _crossed(
@@ -717,8 +721,12 @@ def _most_likely(
     scales = tracks[0].scales
     white = _white_states(machine, names)
     places, floor = [names.index(n) for n in white], by_kind(white, DRIFT)
+    colours = levels.colours
+    own = [c.channel for c in colours]
+    tints = [[names.index(label) for label in state_labels([colour])] for colour in colours]
     w = c + m
-    end = w + len(white)
+    v = w + len(white)
+    end = v + len(colours)
     rows = max(_ROWS // len(tracks), _ROWS // 8)
     runs = [_part(track, rows, levels.jitter > 0.0) for track in tracks]
     weight = sum(len(t.run.command) for t in tracks) / sum(len(run[0].error) for run in runs)
@@ -726,9 +734,11 @@ def _most_likely(
     first = len(names) - m
 
     def of(x: np.ndarray) -> Levels:
-        drift = dict(zip(white, np.exp(x[w:end]), strict=True))
+        drift = dict(zip(white, np.exp(x[w:v]), strict=True))
+        tinted = zip(colours, np.exp(x[v:end]).tolist(), strict=True)
         return dataclasses.replace(
             levels, noise=np.exp(x[:c]), sizes=np.exp(x[c:w]), drift=drift,
+            colours=tuple(dataclasses.replace(colour, size=size) for colour, size in tinted),
             jitter=float(np.exp(x[end])) if jittered else levels.jitter,
         )  # fmt: skip
 
@@ -751,21 +761,34 @@ def _most_likely(
             total += value
             slope[:c] += 2.0 * per_noise
             slope[c:w] += 2.0 * per_drift[first:]
-            slope[w:end] += 2.0 * per_drift[places]
+            slope[w:v] += 2.0 * per_drift[places]
+            slope[v:end] += 2.0 * np.array([per_drift[place].sum() for place in tints])
             slope[end:] += 2.0 * per_jitter
-        off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
-        slope[:c] += 2.0 * off / prior.width / weight
-        slope[c:] += 2.0 * lack / _LACK / weight
+        off, lack = prior_terms(x, now)
+        whole = now.whole_noise
+        slope[:c] += 2.0 * off / prior.width / weight * (now.noise / whole) ** 2
+        slope[v:end] += (2.0 * off / prior.width / weight)[own] * (np.exp(x[v:end]) / whole[own]) ** 2
+        slope[priced] += 2.0 * lack / _LACK / weight
         return total + float(off @ off + lack @ lack) / weight, slope
 
+    def prior_terms(x: np.ndarray, now: Levels) -> tuple[np.ndarray, np.ndarray]:
+        """Deviations of the whole noise of the channels, and of what else there may be, from their priors."""
+        return np.log(now.whole_noise / prior.noise) / prior.width, (x - low)[priced] / _LACK
+
     period = min(track.run.period for track in tracks)
-    low = np.concatenate([prior.low, LEAST * largest, floor, [_LEAST_JITTER * period]])
-    high = np.concatenate([prior.high, largest, _MOST * floor, [_MOST_JITTER * period]])
+    least = prior.low.copy()
+    least[own] = _WHITE_LEFT * prior.noise[own]
+    tint_low = [0.5 * _FAINT * _WHITE_LEFT * prior.noise[k] for k in own]
+    low = np.concatenate([least, LEAST * largest, floor, tint_low, [_LEAST_JITTER * period]])
+    high = np.concatenate([
+        prior.high, largest, _MOST * floor, largest_colours(prior)[own], [_MOST_JITTER * period],
+    ])  # fmt: skip
+    priced = np.setdiff1d(np.arange(c, end + jittered), np.arange(v, end))
     low, high = (np.log(bound[: end + jittered]) for bound in (low, high))
     began = np.array([levels.drift.get(n, 0.0) for n in white])
     start = np.log(np.concatenate([
         levels.noise, np.maximum(levels.sizes, 3 * LEAST * largest), np.maximum(began, 1.5 * floor),
-        [levels.jitter] if jittered else [],
+        [colour.size for colour in colours], [levels.jitter] if jittered else [],
     ]))  # fmt: skip
     found = minimize(
         loss, np.clip(start, low, high), jac=True, method="L-BFGS-B",
@@ -773,8 +796,65 @@ def _most_likely(
         options={"maxiter": _ITERATIONS, "ftol": 1e-6},
     )  # fmt: skip
     x = found.x
-    off, lack = (x[:c] - np.log(prior.noise)) / prior.width, (x[c:] - low[c:]) / _LACK
+    off, lack = prior_terms(x, of(x))
     return dataclasses.replace(of(x), penalty=float(off @ off + lack @ lack))
+
+
+def largest_colours(prior: Prior) -> np.ndarray:
+    """(c,) largest standard deviation of coloured noise: what the prior of the noise allows with 95 %."""
+    return prior.noise * np.exp(2.0 * prior.width)
+
+
+def propose_colours(data: Dataset, tracks: Sequence[Track], min_gain: float, seed: int = 0) -> Levels | None:
+    """Propose the coloured noise that the readings of a model show.
+
+    The smoothed noise of a right model has the spectrum that the model's own readings have; these are simulated once.
+
+    Args:
+        data: the dataset.
+        tracks: of the model, linearised.
+        min_gain: twice the log likelihood that the coloured noise of a channel must bring.
+        seed: of the simulated readings.
+
+    Returns:
+        The levels with coloured noise of the channels that want it; None if no further channel has any.
+    """
+    levels, rng = tracks[0].levels, np.random.default_rng(seed)
+    taken = {colour.channel for colour in levels.colours}
+    spectra = [_noise_spectrum(track, rng) for track in tracks]
+    noise, colours, largest = levels.noise.copy(), list(levels.colours), largest_colours(noise_prior(data))
+    for c in range(len(noise)):
+        if c in taken or not noise[c] < largest[c]:
+            continue
+        colour, white, gain = find_colour(spectra, c, noise[c] ** 2, largest[c])
+        if gain > min_gain:
+            noise[c] = white
+            colours.append(colour)
+    if len(colours) == len(taken):
+        return None
+    return dataclasses.replace(levels, noise=noise, colours=tuple(colours))
+
+
+def _noise_spectrum(track: Track, rng: np.random.Generator) -> Spectrum:
+    """Spectra of a track's smoothed noise over its variance, and of that of readings that its filter would make."""
+    run, noise, drift = linear_run(track, track.unknown_command_variances), row_variances(
+        track.levels, track.run), track.process_variances  # fmt: skip
+    rows, channels, size = run.slope.shape
+    state = np.zeros(size)
+    first = np.linalg.eigh(run.initial)
+    state = first[1] @ (np.sqrt(np.maximum(first[0], 0.0)) * rng.standard_normal(size))
+    drawn = np.empty((rows, channels))
+    for row in range(rows):
+        drawn[row] = run.slope[row] @ state + np.sqrt(noise[row]) * rng.standard_normal(channels)
+        state = state @ run.flow[row] + np.sqrt(drift + run.startle[row]) * rng.standard_normal(size)
+    there = np.isfinite(run.error)
+    made = run._replace(error=np.where(there, drawn, np.nan), correction=np.zeros_like(run.correction))
+    found = []
+    for one in (run, made):
+        told = smooth(one, noise, drift, True)
+        left = one.error - np.einsum("rcs,rs->rc", one.slope, told.deviation)
+        found.append(np.where(there, left / noise, 0.0))
+    return measure_spectrum(found[0], found[1], track.run.period)
 
 
 def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:

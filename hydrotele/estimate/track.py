@@ -22,7 +22,9 @@ from scipy.signal import savgol_filter
 
 from hydrotele.core.compiled import compiled
 from hydrotele.effects.transmission import natural_frequency
+from hydrotele.estimate.colour import STATE, Colour, join_transitions, state_labels
 from hydrotele.estimate.filter import (
+    ColouredNoise,
     Crossing,
     Gains,
     Input,
@@ -289,6 +291,7 @@ class Levels:
             `state_scales`), where that is not the floor that `DRIFT` states.
         jitter: standard deviation of the instants at which channels are read [s].
         penalty: -2 log prior of the levels.
+        colours: coloured parts of the readings' noise; `noise` is the white part.
     """
 
     noise: np.ndarray
@@ -297,6 +300,15 @@ class Levels:
     drift: Mapping[str, float] = field(default_factory=dict)
     jitter: float = 0.0
     penalty: float = 0.0
+    colours: tuple[Colour, ...] = ()
+
+    @property
+    def whole_noise(self) -> np.ndarray:
+        """(c,) standard deviation of a reading's noise, white and coloured [channel's unit]."""
+        found = self.noise**2
+        for colour in self.colours:
+            found[colour.channel] += colour.size**2
+        return np.sqrt(found)
 
 
 @dataclass(frozen=True)
@@ -353,7 +365,7 @@ _NUDGE = {
     "spool_rate": 1e-3, "pressure_head": 100.0, "pressure_rod": 100.0,
     "speed": 1e-3, "pressure_load": 100.0,
     "bristle": 1e-3, "delivery": 1e-4, "added_delivery": 1e-4, "memory": 1e-3, "late": 1.0,
-    "input": 1.0,
+    "input": 1.0, STATE: 1.0,
 }  # fmt: skip
 # What 20 ms may add to a state beyond the model: integrator error, not physics.
 DRIFT = {
@@ -521,6 +533,9 @@ def state_drift(names: list[str], levels: Levels, period: float, scales: np.ndar
     drift = period / DRIFT_TIME * (scales * by_kind(names, {**DRIFT, **levels.drift})) ** 2
     m = len(levels.inputs)
     drift[len(names) - m :] = input_drift(levels.sizes, period)
+    for colour in levels.colours:
+        for label in state_labels([colour]):
+            drift[names.index(label)] = colour.drift(period)
     return drift
 
 
@@ -628,6 +643,7 @@ def _cross(
     names += [
         f"late.{channel}.{i - late.first[k]}" for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
     ]
+    names += state_labels(levels.colours)
     names += [f"input.{i.name}" for i in levels.inputs]
     full = len(names)
     if kept is None:
@@ -647,6 +663,9 @@ def _cross(
     state[:size], covariance[:size, :size] = start, spread
     at = np.arange(full - m, full)
     covariance[at, at] = levels.sizes**2
+    for colour in levels.colours:
+        for label in state_labels([colour]):
+            covariance[names.index(label), names.index(label)] = colour.size**2
     initial = np.zeros((full, full))
     if given is not None and given.shape[1] != full:  # another number of readings on their way
         given = None
@@ -662,7 +681,8 @@ def _cross(
         model, space, late, state, covariance,
         MeasuredRun(run.command, run.command_known, run.reading, run.period), variances,
         (steps, lines),
-        InputEffect(columns, decay(run.period)), Crossing(whitened, predicted, states),
+        (InputEffect(columns, decay(run.period)), ColouredNoise(*join_transitions(levels.colours, run.period))),
+        Crossing(whitened, predicted, states),
     )  # fmt: skip
     return Track(
         run, levels, loss, whitened, predicted, states, gains, known, start, rest, columns,

@@ -167,6 +167,15 @@ def lack_words(lack: Lack) -> str:
     return f"Missing in the model: {what} of {amount(lack.size, lack.unit)} (standard deviation)."
 
 
+def lack_title(balance: str, axis: str) -> str:
+    """A residual input in a few words.
+
+    >>> lack_title("flow_head", "boom")
+    'Oil flow into the boom head side'
+    """
+    return _capital(_LACKS[balance].format(axis=axis).partition(" ")[2])
+
+
 def number_title(key: str) -> str:
     """A calibrated number in plain words.
 

@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 
 from hydrotele.effects import locate_error_in_effect_file
 from hydrotele.effects.effect import with_value
+from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
@@ -21,9 +22,11 @@ from hydrotele.gap.calibrating import (
     calibrate_freely,
     fit_until_settled,
 )
-from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
+from hydrotele.gap.description import describe, effect_title, learned_laws
+from hydrotele.gap.discover import LEARNED, Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
+from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
+from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import search_model
 from hydrotele.gap.profiles import find_profiles, profile_words
@@ -51,6 +54,7 @@ from hydrotele.gap.result import (
     NamedEffect,
     Prediction,
     Verdict,
+    VerdictExplanation,
 )
 from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
@@ -96,6 +100,7 @@ def find_gap(
     jobs: int = 2,
     keep: Callable[[Interim], None] | None = None,
     method: Method = "search",
+    warn: Callable[[str], None] = lambda text: None,
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -107,6 +112,7 @@ def find_gap(
         jobs: processors that it may use.
         keep: called with the best answer so far, each time that there is a better one.
         method: `search`, or `regression` of `gap.model_search`.
+        warn: called with one sentence per gross error of the logs, before the search.
 
     Returns:
         The gap, named or not.
@@ -117,9 +123,9 @@ def find_gap(
     """
     find = search_model if method == "regression" else search
     begin = time.perf_counter()
-    tell = progress or (lambda text, share: None)
+    report = progress or (lambda text, share: None)
     given, notes = data.machine, []
-    opened = None if effects else calibrate_freely(data, jobs, lambda text: tell(text, 0.0))
+    opened = None if effects else calibrate_freely(data, jobs, lambda text: report(text, 0.0))
     if opened:
         data = dataclasses.replace(data, machine=opened.machine)
         notes.append(opened.note)
@@ -129,17 +135,33 @@ def find_gap(
             raise own
         notes.append(f"Not tried: {error}.")
     data = downsample(select_exciting_segments(data))
+    report("run initial regressions", 0.0)
+    initial = run_initial_regressions(data)
+    for gross in initial.errors:
+        warn(gross.description)
+    if method == "regression":
+        candidates = with_start_values(candidates, initial)
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
-    if keep:
-        evidence.keep = keep_better(data.machine, keep, begin)
+    interim = keep_better(data.machine, keep, begin) if keep else lambda judged: None
+    leader = ""
+
+    def keep_best(judged: Judged) -> None:
+        nonlocal leader
+        leader = best_words(judged.guess)
+        interim(judged)
+
+    def tell(text: str, share: float) -> None:
+        report(f"{text}; best so far: {leader}" if leader else text, share)
+
+    evidence.keep = keep_best
     try:
-        found = find(evidence, candidates, progress)
+        found = find(evidence, candidates, tell)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
                 notes.append(_REJECTED.format(worse))
                 found = found.emptied()
-                evidence.set_base(found.base)
+                keep_best(evidence.set_base(found.base))
             tell("learn laws of the unexplained difference", 0.93)
             found, discovery = _learned(evidence, found)
             evidence.keep(discovery.judged)
@@ -172,6 +194,7 @@ def find_gap(
         if method == "regression":
             method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
+        traces = trace_inputs(evidence.data, found.base, discovery.judged)
     finally:
         evidence.close()
     failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
@@ -228,9 +251,32 @@ def find_gap(
         notes=(*data.notes, *notes, *map(detail_words, details), *method_notes,
                *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
-        answers=tuple(answer_document(named)) if method == "regression" else None,
+        answers=tuple(answer_document(named)),
+        initial=initial,
+        explanation=VerdictExplanation(
+            compare_contenders(found, named),
+            list_rejections(found, named, details, _MINOR, [n for n in notes if "rejected" in n]),
+            traces,
+        ),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def best_words(guess: Guess) -> str:
+    """Name what a hypothesis consists of, for a progress display; empty for the given machine.
+
+    >>> best_words(Guess(((Hypothesis("payload", "tool", {}), np.zeros(0)),)))
+    'payload at the tool'
+    """
+    words = []
+    for hypothesis in guess.hypotheses:
+        if hypothesis.name == CALIBRATION:
+            words.append("calibrated parameters")
+        elif hypothesis.name.startswith(LEARNED):
+            words.append("a learned law")
+        else:
+            words.append(effect_title(Alternative(*hypothesis.key, 0.0)))
+    return " and ".join(dict.fromkeys(words))
 
 
 class _Judge:
@@ -240,7 +286,7 @@ class _Judge:
         found = judged.tracks[0].levels
         self.data, self.ripple = data, rippled(found)
         drift = found.drift if self.ripple else {}
-        self.levels = Levels(found.noise, drift=drift, jitter=found.jitter)
+        self.levels = Levels(found.noise, drift=drift, jitter=found.jitter, colours=found.colours)
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
@@ -261,13 +307,15 @@ class _Judge:
 
         A floor is refused where the perfect machine's own runs cannot be followed: they left the
         model's range, or the filter does not hold them. With process noise (ripple, contact, what
-        the rows are too slow for) it is that noise that the floor counts, by definition 1.
+        the rows are too slow for) or coloured noise of sensors it is that noise that the floor counts,
+        by definition 1.
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
-        perfect = () if self.ripple else perfect_tracks(machine, noisy, tracks, evidence.map)
-        floor = 1.0 if self.ripple else rms(perfect[:1])
+        known = self.ripple or bool(self.levels.colours)
+        perfect = () if known else perfect_tracks(machine, noisy, tracks, evidence.map)
+        floor = 1.0 if known else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
-        clean = holds and not self.ripple
+        clean = holds and not known
         tests = residual_tests(tracks, self.data.channels, perfect if clean else ())
         if clean and has_sizes(judged.guess):
             made = Evidence(noisy, [track.run for track in perfect[1:]], 1, evidence.step)
@@ -624,7 +672,7 @@ def _far(guess: Guess) -> list[str]:
 def _noise(data: Dataset, levels: Levels) -> dict[str, tuple[float, float]]:
     return {
         channel: (float(found), float(stated))
-        for channel, found, stated in zip(data.channels, levels.noise, data.noise, strict=True)
+        for channel, found, stated in zip(data.channels, levels.whole_noise, data.noise, strict=True)
     }
 
 
@@ -665,15 +713,26 @@ def _jitter(data: Dataset, levels: Levels) -> tuple[float, float]:
     return (found if abs(found - stated) > _JITTER * max(found, stated) else stated), stated
 
 
+def _colour_words(channel: str, colour: Colour, white: float) -> str:
+    """Describe the coloured noise of a channel."""
+    share = colour.size**2 / (colour.size**2 + white**2)
+    kind = f"with a resonance at {colour.frequency:.3g} Hz" if colour.frequency else "of first order"
+    return (
+        f"{100.0 * share:.0f} % of the noise variance of {channel} is coloured, {kind}"
+        f" (correlation time {colour.memory:.2g} s)."
+    )
+
+
 def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> list[str]:
     notes = []
-    ratio = levels.noise / data.noise
+    ratio = levels.whole_noise / data.noise
     off = [
         f"{channel} {100 * (r - 1):+.0f} %" for channel, r in zip(data.channels, ratio, strict=True)
         if np.isfinite(r) and abs(r - 1.0) > _OFF
     ]  # fmt: skip
     if off:
         notes.append(f"The noise differs from the machine file: {', '.join(off)}.")
+    notes += [_colour_words(data.channels[c.channel], c, levels.noise[c.channel]) for c in levels.colours]
     jitter, stated = _jitter(data, levels)
     if not jitter and stated:
         notes.append(f"The data show no sampling jitter; the machine file states {1e3 * stated:.3g} ms.")

@@ -19,7 +19,7 @@ import numpy as np
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
-from hydrotele.estimate.levels import linear_filter, linear_run
+from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
@@ -75,6 +75,16 @@ class Model:
         """The effects and their parameters."""
         return self.judged.guess
 
+    @property
+    def colours(self) -> frozenset[int]:
+        """Channels whose noise has a coloured part."""
+        return frozenset(c.channel for c in self.judged.tracks[0].levels.colours)
+
+    @property
+    def charged_score(self) -> float:
+        """The score plus what every effect and every coloured noise must bring."""
+        return self.score + MIN_LOG_BAYES_FACTOR * (len(self.guess.parts) + len(self.colours))
+
 
 @dataclass(frozen=True)
 class Round:
@@ -88,6 +98,11 @@ class Round:
 def keys_of(model: Model) -> set[tuple[str, str]]:
     """Return names and locations of the effects of a model."""
     return {h.key for h in model.guess.hypotheses}
+
+
+def is_same(one: Model, other: Model) -> bool:
+    """Return whether two models have the same effects, and coloured noise of the same channels."""
+    return keys_of(one) == keys_of(other) and one.colours == other.colours
 
 
 @dataclass(frozen=True)
@@ -126,27 +141,27 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
     given = Model(settle_noise(evidence, evidence.judged(Guess())))
+    evidence.keep(given.judged)
     candidates = timed([c for c in candidates if c.name not in _EXCLUDED], given.judged)
     now, first = given, tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
     for index in range(_MAX_EFFECTS):
         share = 0.05 + 0.8 * index / _MAX_EFFECTS
-        tell(f"compare effects{_words(now)}", share)
+        tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
         proposals = propose(evidence, now, pool)
         first = first or tuple(proposals)
         keys = keys or {p.key for p in proposals[:_KEPT]}
-        tell(f"refine the best effects{_words(now)}", share + 0.03)
+        tell("refine the best effects", share + 0.03)
         models = extensions(evidence, now, proposals)
-        better = min(models, key=lambda m: m.score + MIN_LOG_BAYES_FACTOR * len(m.guess.parts), default=now)
-        if better is now or now.score - better.score < MIN_LOG_BAYES_FACTOR * (
-            len(better.guess.parts) - len(now.guess.parts)
-        ):
+        better = min((*models, *colour_noise(evidence, now)), key=lambda m: m.charged_score, default=now)
+        if not better.charged_score < now.charged_score:
             break
         settled = settle(evidence, better)
         rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
         now = settled
+        evidence.keep(now.judged)
     tell("remove unnecessary effects", 0.87)
     now, rests = remove_needless(evidence, given, now, rounds)
     tell("compare alternative effects", 0.9)
@@ -183,11 +198,6 @@ def settle(evidence: Evidence, model: Model) -> Model:
         return Model(settle_noise(evidence, model.judged))
     judged, fit = fit_until_settled(evidence, model.judged)
     return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
-
-
-def _words(model: Model) -> str:
-    names = ", ".join(f"{h.name} {h.location}" for h in model.guess.hypotheses)
-    return f" beside {names}" if names else ""
 
 
 # -- linear step ------------------------------------------------------------------------------------------------------
@@ -372,6 +382,23 @@ def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) ->
     return [m for m in (refine(evidence, now, p) for p in chosen) if m is not None]
 
 
+def colour_noise(evidence: Evidence, now: Model) -> list[Model]:
+    """Return a model with coloured noise of the channels whose readings show it; it has no other new part.
+
+    Args:
+        evidence: whose base is the model; it is the base afterwards, too.
+        now: the model.
+
+    Returns:
+        That model, or nothing.
+    """
+    levels = propose_colours(evidence.data, now.judged.tracks, MIN_LOG_BAYES_FACTOR)
+    if levels is None:
+        return []
+    judged = evidence.judged_from(now.guess, levels)
+    return [Model(judged, now.fit, now.penalty)] if np.isfinite(judged.loss) else []
+
+
 def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
     """Fit a proposal together with a model, re-estimate the noise levels, and compute the evidence.
 
@@ -431,10 +458,10 @@ def scaled_calibration(machine: Machine, guess: Guess, scale: float) -> Hypothes
 def without_part(evidence: Evidence, given: Model, now: Model, index: int, rounds: Sequence[Round]) -> Model:
     """Return a model without one of its effects, fitted again; the larger model is the base afterwards."""
     guess = now.guess.without(index)
-    if not guess.parts:
+    if not guess.parts and not now.colours:
         return given
     for known in rounds:
-        if keys_of(known.before) == {h.key for h in guess.hypotheses}:
+        if keys_of(known.before) == {h.key for h in guess.hypotheses} and known.before.colours == now.colours:
             return known.before
     evidence.set_base(now.judged)
     rest = settle(evidence, Model(evidence.judged(guess, reopened=True)))
@@ -475,7 +502,7 @@ def exchange(
             continue
         rest, taken = rests[index], keys_of(now)
         models = [
-            model if keys_of(origin.before) == keys_of(rest) else add_rival(evidence, rest, origin, model)
+            model if is_same(origin.before, rest) else add_rival(evidence, rest, origin, model)
             for model in origin.others if _is_rival(keys_of(model) - keys_of(origin.before), taken)
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]

@@ -204,6 +204,145 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Regression:
+    """A fitted balance of one drive.
+
+    Attributes:
+        balance: force, flow or length.
+        axis: the drive.
+        unit: of the measured quantity, SI.
+        coefficients: name (`factor`, `viscous`, `coulomb`, `per_position`, `constant`) -> estimate, whose
+            `nominal` is that of the given machine.
+        explained: fraction of the variance of the measured quantity that the fit explains, robust.
+        explained_nominal: the same of the given machine; NaN if it states no number.
+        rows: number of rows.
+        points: name (`measured`, `model`, `velocity`, `position`, `drive`) -> (k,) values of some rows [SI].
+    """
+
+    balance: str
+    axis: str
+    unit: str
+    coefficients: Mapping[str, Estimate]
+    explained: float
+    explained_nominal: float
+    rows: int
+    points: Mapping[str, np.ndarray] = field(repr=False)
+
+
+@dataclass(frozen=True)
+class GrossError:
+    """A gross error of a log or of a machine file.
+
+    Attributes:
+        kind: `exchanged columns`, `wrong sign`, `wrong unit`, `factor` or `unexplained`.
+        channels: the columns, or balance and drive.
+        probability: of it against all alternatives.
+        explained: fraction of the variance explained if it is corrected; NaN if nothing explains it.
+        explained_as_logged: the same without a correction.
+        description: one sentence.
+    """
+
+    kind: str
+    channels: tuple[str, ...]
+    probability: float
+    explained: float
+    explained_as_logged: float
+    description: str
+
+
+@dataclass(frozen=True)
+class InitialRegressions:
+    """What regressions on measured quantities say before a search.
+
+    Attributes:
+        regressions: by balance and drive, of the log as it is.
+        errors: gross errors, in the order in which they were found.
+    """
+
+    regressions: tuple[Regression, ...]
+    errors: tuple[GrossError, ...]
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A candidate in the place of a named effect.
+
+    Attributes:
+        name: of the effect.
+        location: where it acts.
+        log_bayes_factor: twice the log Bayes factor against no effect in this place.
+        probability: of it, among all candidates and none.
+    """
+
+    name: str
+    location: str
+    log_bayes_factor: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The candidates in the place of a named effect (name, location), the one with the largest Bayes factor first."""
+
+    name: str
+    location: str
+    contenders: tuple[Contender, ...]
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """What was tried and not named.
+
+    Attributes:
+        name: of the effect; empty if the test says all.
+        location: where it acts.
+        test: that it failed.
+        value: of the test; NaN if it has none.
+        limit: that the value had to exceed; NaN if there is none.
+    """
+
+    name: str
+    location: str
+    test: str
+    value: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class InputTrace:
+    """A residual input along one run.
+
+    Attributes:
+        run: name of the run.
+        balance: force, flow_head, flow_rod, command or flow_supply.
+        axis: on which it acts.
+        unit: SI.
+        time: (n,) [s].
+        given: (n,) what the given model misses [unit], NaN where unknown.
+        remaining: (n,) what the corrected model misses [unit].
+        added: (n,) what the corrected model adds in this balance [unit]; None if it adds states or nothing.
+    """
+
+    run: str
+    balance: str
+    axis: str
+    unit: str
+    time: np.ndarray
+    given: np.ndarray
+    remaining: np.ndarray
+    added: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class VerdictExplanation:
+    """Why the verdict: candidates, rejections, and residual inputs over time."""
+
+    comparisons: tuple[Comparison, ...] = ()
+    rejections: tuple[Rejection, ...] = ()
+    traces: tuple[InputTrace, ...] = ()
+
+
+@dataclass(frozen=True)
 class Prediction:
     """One-step predictions of one run by one model.
 
@@ -259,6 +398,8 @@ class Gap(Generic[Model]):
         open_loop: how far the models run away from the measured motion when the measured forces
             drive them: `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]); or None.
         answers: per effect its hierarchical answer as of `gap.answer`; None where no method gives it.
+        initial: regressions on measured quantities before the search; None where none were made.
+        explanation: candidates, rejections and residual inputs; None where no search gives them.
     """
 
     machine: Model
@@ -284,6 +425,8 @@ class Gap(Generic[Model]):
     open_loop: Mapping[str, Any] | None = None
     unused_channels: tuple[str, ...] = ()
     answers: tuple[Mapping[str, Any], ...] | None = None
+    initial: InitialRegressions | None = None
+    explanation: VerdictExplanation | None = None
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -317,8 +460,10 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `unused_channels`: logged channels that were not used, with the reason.
         Of a mechanism also `open_loop`: `horizon` [s], `before` and `after` (joint -> RMS [rad] or
         [m] by which a model runs away within it when the measured forces drive it), or null.
-        With the method `regression` also `answers`: per effect `sure` (the deepest of place, family and law that is
+        Of a machine also `answers`: per effect `sure` (the deepest of place, family and law that is
         sure), and the probabilities of `places`, `families` there, `laws`, and `none`.
+        `initial_regressions`: regressions on measured quantities before the search, `regressions_document`.
+        `explanation`: why the verdict, `explanation_document`.
     """
     unknown = gap.unknown and {
         "law": gap.unknown.law,
@@ -331,7 +476,9 @@ def gap_document(gap: Gap) -> dict[str, Any]:
     laws = {law: {"unit": gap.law_units.get(law, "1"), "places": places} for law, places in gap.laws.items()}
     open_loop = {} if gap.open_loop is None else {"open_loop": gap.open_loop}
     answers = {} if gap.answers is None else {"answers": gap.answers}
-    return finite(open_loop | answers | {
+    initial = {} if gap.initial is None else {"initial_regressions": regressions_document(gap.initial)}
+    why = {} if gap.explanation is None else {"explanation": explanation_document(gap.explanation)}
+    return finite(open_loop | answers | initial | why | {
         "verdict": gap.verdict,
         "effects": [effect_document(effect) for effect in gap.effects],
         "calibration": {
@@ -361,6 +508,60 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         "notes": list(gap.notes),
         "seconds": gap.seconds,
     })  # fmt: skip
+
+
+def regressions_document(found: InitialRegressions) -> dict:
+    """Return the regressions as plain data for `gap.json`.
+
+    Returns:
+        `errors`: gross errors with `kind`, `channels`, `probability`, `explained`, `explained_as_logged`,
+        `description`. `regressions`: `balance`, `axis`, `unit`, `explained` and `explained_nominal` (fraction of the
+        variance), `rows`, and `coefficients`: name -> `value`, `nominal`, `unit`, `ci95`.
+    """
+    regressions = [
+        {
+            "balance": r.balance, "axis": r.axis, "unit": r.unit, "explained": r.explained,
+            "explained_nominal": r.explained_nominal, "rows": r.rows,
+            "coefficients": {
+                name: {"value": e.value, "nominal": e.nominal, "unit": e.unit, "ci95": [e.low, e.high]}
+                for name, e in r.coefficients.items()
+            },
+        }
+        for r in found.regressions
+    ]  # fmt: skip
+    errors = [
+        {
+            "kind": e.kind, "channels": list(e.channels), "probability": e.probability, "explained": e.explained,
+            "explained_as_logged": e.explained_as_logged, "description": e.description,
+        }
+        for e in found.errors
+    ]  # fmt: skip
+    return {"errors": errors, "regressions": regressions}
+
+
+def explanation_document(why: VerdictExplanation) -> dict[str, Any]:
+    """Return an explanation as plain data for `gap.json`.
+
+    Returns:
+        `candidates`: per named effect `name`, `location` and its `contenders` with `log_bayes_factor` (twice the log
+        Bayes factor against none) and `probability`. `rejected`: `name`, `location`, `test`, `value`, `limit`.
+        `residual_inputs`: `run`, `balance`, `axis`, `unit`, and RMS `given`, `remaining`, `added`.
+    """
+
+    def rms(values: np.ndarray | None) -> float | None:
+        return None if values is None or not np.isfinite(values).any() else float(np.sqrt(np.nanmean(values**2)))
+
+    return {
+        "candidates": [dataclasses.asdict(c) for c in why.comparisons],
+        "rejected": [dataclasses.asdict(r) for r in why.rejections],
+        "residual_inputs": [
+            {
+                "run": t.run, "balance": t.balance, "axis": t.axis, "unit": t.unit, "given": rms(t.given),
+                "remaining": rms(t.remaining), "added": rms(t.added),
+            }
+            for t in why.traces
+        ],
+    }  # fmt: skip
 
 
 def effect_document(effect: NamedEffect) -> dict[str, Any]:

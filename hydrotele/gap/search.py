@@ -355,7 +355,7 @@ def _grow(
             options = list(early)
         else:
             if ranked is None:
-                tell(f"evaluate every effect ({_named_so_far(now.guess)} found so far)", done)
+                tell("evaluate every effect", done)
                 open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
                 ranked = screen(evidence, now.guess, open_ones)
                 first = first if rankings else ranked

@@ -46,6 +46,7 @@ from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine import Machine
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
+from hydrotele.show.gap_explanation import regression_content, why_content
 from hydrotele.show.prediction_errors import channel_rms, find_most_improved_channels, windowed_errors
 from hydrotele.show.report_html import (
     figure_to_png,
@@ -91,7 +92,7 @@ def write_report(gap: Gap, path: str | Path) -> None:
         proof_words=_VALIDATION_TEXTS[mechanism].format(gap.before[0].run if gap.before else ""),
         commands=_COMMANDS[mechanism], open_loop=_open_loop_content(gap),
         noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_next_experiment_content(gap), notes=gap.notes,
-        unused=gap.unused_channels,
+        unused=gap.unused_channels, regressions=regression_content(gap), why=why_content(gap),
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
 

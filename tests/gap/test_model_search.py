@@ -1,8 +1,11 @@
 """The search by evidence: versions of an effect, residual inputs that are scaled, and one whole search."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.track import STEP
@@ -16,6 +19,7 @@ from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import MEASURED
+from tests.small_machines import add_coloured_noise, simulate_data
 
 
 def _effect(name, location):
@@ -76,6 +80,23 @@ def test_a_dead_band_is_found_with_its_size(short_logs):
     (answer,) = gap_document(gap)["answers"]
     assert answer["sure"][:1] == ["stick"]
     assert sum(answer["laws"].values()) + answer["none"] == pytest.approx(1.0)
+
+
+def test_a_machine_with_coloured_sensor_noise_has_no_gap():
+    """All sensors of the rig resonate at 60 Hz with half of the stated variance: the noise is named, no effect is."""
+    noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
+    channels = ("position.slide", "pressure_head.slide", "pressure_rod.slide")
+    data = simulate_data(load_machine("rig"), channels, noise, period=0.005, rows=1000, noise_stated=True)
+    colours = {name: Colour(c, float(data.noise[c]), 0.04, 60.0) for c, name in enumerate(channels)}
+    data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
+    effects = ("coulomb_friction", "valve_deadband", "internal_leakage", "spool_lag", "pressure_lag")
+    gap = find_gap(data, effects=effects, jobs=1, method="regression")
+    assert gap.verdict == "no_gap"
+    assert not gap.effects
+    notes = [note for note in gap.notes if "resonance" in note]
+    assert [note.partition(" of ")[2].split()[4] for note in notes] == list(channels)
+    for found, stated in gap.noise.values():
+        assert found == pytest.approx(stated, rel=0.15)  # 1000 readings with a correlation time of 8 rows
 
 
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():

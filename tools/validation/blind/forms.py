@@ -27,7 +27,7 @@ class Form:
     Attributes:
         name: what the key calls it.
         sentence: what it is, with its source.
-        kind: what it sits at: `axis`, `motor`, `port`, `supply`, `all` or `axis or all`.
+        kind: what it sits at: `axis`, `link`, `motor`, `port`, `supply`, `all` or `axis or all`.
         accepted: names that are right at the place; `name@all` or `name@supply` at that place.
         change: (independent machine, facts, place, rng) -> (changed machine, its numbers).
         tie: further names that count only for a swing, where nothing tells them apart.
@@ -48,6 +48,8 @@ class Form:
                 return [f"{axis}.{side}" for axis in names for side in ("head", "rod")]
             case "motor":
                 return [axis for axis in names if facts.axes[axis].motor]
+            case "link":
+                return names if facts.arm else []
             case "axis" | "axis or all":
                 return names + (["all"] if self.kind != "axis" and len(names) > 1 else [])
             case _:
@@ -251,7 +253,7 @@ FORMS: dict[str, Form] = {
              " say", "motor", ("backlash",), _contact_backlash),
         Form("hardening_shaft", "a shaft that stiffens as it winds", "motor",
              ("joint_flexibility",), _hardening_shaft),
-        Form("heavy_inertia", "a link's moment of inertia 3 to 10 times the model's", "axis",
+        Form("heavy_inertia", "a link's moment of inertia 3 to 10 times the model's", "link",
              ("inertia_error",), _heavy, ("com_offset",)),
         Form("soft_deadband", "a larger overlap whose edges let a little pass", "axis",
              ("valve_deadband", "valve_deadband_direction", "flow_curve"), _soft_deadband),

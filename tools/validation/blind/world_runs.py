@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+from scipy.signal import lfilter
 
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.drive_linkage import axis_linkage
@@ -64,21 +65,39 @@ class Noise:
     Attributes:
         factor: kind of channel (angle, position, length, pressure) -> factor of its RMS.
         gaussian: normal instead of uniform.
+        coloured: share of the variance with the autocorrelation exp(-t / memory) cos(2 pi frequency t).
+        memory: correlation time of that part [s].
+        frequency: of its resonance [Hz], 0 for none.
     """
 
     factor: dict[str, float]
     gaussian: bool = False
+    coloured: float = 0.0
+    memory: float = 1.0
+    frequency: float = 0.0
 
-    def draw(self, facts: Facts, rows: int, rng: np.random.Generator) -> np.ndarray:
-        """Errors (rows, c) before the converter [channel's unit]."""
+    def draw(self, facts: Facts, rows: int, rng: np.random.Generator, period: float = 0.02) -> np.ndarray:
+        """Errors (rows, c) before the converter [channel's unit], of rows at a period [s]."""
         names = channels(facts)
         bound, _ = stated_errors(facts, _sensors(facts))
         kinds = ["pressure" if n.startswith("pressure") else n.partition(".")[0] for n in names]
         bound = bound * [self.factor.get(kind, 1.0) for kind in kinds]
         shape = (rows, len(names))
         if self.gaussian:
-            return rng.normal(size=shape) * bound / np.sqrt(3.0)
-        return rng.uniform(-1.0, 1.0, shape) * bound
+            white = rng.normal(size=shape) * bound / np.sqrt(3.0)
+        else:
+            white = rng.uniform(-1.0, 1.0, shape) * bound
+        if not self.coloured:
+            return white
+        tint = self._colour(shape, rng, period) * bound / np.sqrt(3.0)
+        return np.sqrt(1.0 - self.coloured) * white + np.sqrt(self.coloured) * tint
+
+    def _colour(self, shape: tuple[int, int], rng: np.random.Generator, period: float) -> np.ndarray:
+        """Coloured noise of a variance of 1: a point that turns and decays, driven by normal noise."""
+        turn = np.exp((2j * np.pi * self.frequency - 1.0 / self.memory) * period)
+        drive = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+        drive[1:] *= np.sqrt(1.0 - abs(turn) ** 2)
+        return np.real(lfilter([1.0], [1.0, -turn], drive, axis=0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,7 +240,7 @@ def record_run(
     steps = round(reference.period / STEP[model.name])
     readings, clean = simulate(
         machine, start, commands, True, reference.joints, reference.ahead, arm, gains,
-        noise.draw(model, rows, rng), reference.period, steps, 0, states,
+        noise.draw(model, rows, rng, reference.period), reference.period, steps, 0, states,
     )  # fmt: skip
     _check(model, states)
     return WorldRun(reference.name, _log(model, reference, commands, readings), commands, states,

@@ -36,7 +36,7 @@ from tools.validation.blind.world_runs import (
     visibility,
 )
 
-KINDS = ("near", "noise", "off", "outside", "clean", "library")
+KINDS = ("near", "noise", "off", "outside", "clean", "library", "coloured")
 _ATTEMPTS = 20
 _SENSOR_KINDS = ("angle", "position", "length", "pressure")
 _PLANTED_SHARE = 0.5  # of the trials with wrong noise or wrong numbers that hide an effect, too
@@ -110,13 +110,16 @@ def draw_trial(model: Facts, kind: str, turn: int, rng: np.random.Generator) -> 
     if kind == "noise":
         factors = {name: log_uniform(rng, 0.7, 2.0) for name in _SENSOR_KINDS}
         noise = Noise(factors, gaussian=bool(rng.random() < 0.5))
+    if kind == "coloured":
+        noise = Noise({}, True, rng.uniform(0.5, 1.0), log_uniform(rng, 0.05, 0.5),
+                      float(rng.uniform(5.0, 20.0)) if rng.random() < 0.5 else 0.0)  # fmt: skip
     if kind == "off":
         facts, numbers = off_everywhere(model, rng)
     if kind == "near":
         return _draw_form(model, turn, rng, noise)
     planted: list[dict[str, Any]] = []
     count = {"library": 2 if turn % 10 < 10 * _DOUBLE_SHARE else 1}.get(kind, 0)
-    if kind in ("noise", "off") and turn % 2 < 2 * _PLANTED_SHARE:
+    if kind in ("noise", "off", "coloured") and turn % 2 < 2 * _PLANTED_SHARE:
         count = 1
     bare, alone = facts, []
     for _ in range(count):
