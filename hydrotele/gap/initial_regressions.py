@@ -49,9 +49,11 @@ from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, actuator_order, act
 from hydrotele.identify.zero_phase_filter import filter_zero_phase
 from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.kinematics.linkages import LoopOpenError
-from hydrotele.logs.dataset import Dataset, RunData, select_exciting_segments
+from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine import Machine, SensorError
-from hydrotele.multibody.reduced_mechanism import JOINT, factorise_cholesky, solve_cholesky
+from hydrotele.multibody.reduced_dynamics import factorise_cholesky, solve_cholesky
+from hydrotele.multibody.reduced_mechanism import JOINT
 
 MAX_SECONDS = 120.0  # s of all fit runs together, those with the largest command changes: three typical runs
 CUTOFF = 6.0  # Hz, before the nonlinear laws: above every motion of a heavy drive, below its sensor noise
