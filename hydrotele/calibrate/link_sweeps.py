@@ -72,7 +72,7 @@ def generate_sweep_poses(loop: CalibrationLoop, link: str, sweep: Sweep, seed: i
         loop: the true chain.
         link: moving link.
         sweep: its trajectory.
-        seed: seed of the grapple's random rotation.
+        seed: seed of the random rotation of the grapple about the angle at which it points at the ball.
 
     Returns:
         The poses that the calibrator reaches.

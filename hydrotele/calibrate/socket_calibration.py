@@ -75,7 +75,7 @@ def estimate_prior_std_by_kind(
     Args:
         matrix: (m, p) equations with the unknown noise.
         right_hand_side: (m,) right-hand side of these equations.
-        kinds: (p,) kind of each parameter; "" for a parameter with a fixed size.
+        kinds: (p,) kind of each parameter; "" for one whose standard deviation stays at `start`.
         start: (p,) initial standard deviations.
         degrees_of_freedom: degrees of freedom of the m equations before parameters are fitted.
         noise: initial standard deviation of the noise.

@@ -108,7 +108,10 @@ class CommandGroup(typer.Typer):
 
 
 def _escape_help(annotation: Any) -> Any:
-    """Return a parameter's annotation whose help text has escaped brackets, which rich prints as they are."""
+    """Return a parameter's annotation with escaped brackets in its help text.
+
+    rich prints escaped brackets and reads others as markup.
+    """
     type_, *facts = get_args(annotation)
     facts = [copy.copy(fact) for fact in facts]
     for fact in facts:

@@ -43,9 +43,9 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
     Returns:
         (k, 14): kind (1 hydraulic with valve, 0 force drive), head and rod area [m^2], flow gain
         [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force per command, position
-        gain [1/s], velocity gain (force drives), deadband compensation [1], weight of a new
-        value in the slow mean of the drive force [1], bulk modulus [Pa], feedback of the deviation of the
-        force [1/s].
+        gain [1/s], velocity gain (force drives), deadband compensation [1], weight with which
+        each control period adds the present drive force to its slow mean [1], bulk modulus [Pa], gain of
+        the feedback of drive force minus slow mean [1/s].
 
     Raises:
         InputError: a gain is given for an unknown axis.

@@ -248,7 +248,7 @@ class _Reader:
             parents: files of the documents that it is nested in, outermost first.
 
         Returns:
-            The document, and the number of its elements with all copies.
+            The document, and the number of its elements, each counted as often as `replicate` copies it.
         """
         root = self._parse(path)
         included = {path.resolve()}

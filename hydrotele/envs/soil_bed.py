@@ -138,7 +138,7 @@ def init_soil_bed(f, w, soil):
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_soil_bed_parameters`.
         w: SimulationView; `terrain` is written.
-        soil: index of the soil, scalar [1].
+        soil: index of the soil in the list given to `pack_soil_bed_parameters`, scalar [1].
 
     Returns:
         Nothing.

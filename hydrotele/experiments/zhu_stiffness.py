@@ -227,7 +227,10 @@ def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) ->
 
 
 def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
-    """Check that motions with randomly switched stiffness decay and cross the x axis at most once."""
+    """Check that motions with randomly switched stiffness decay, and that the speed changes sign at most once.
+
+    At a change of sign, the path in the plane of position x and speed crosses the x axis.
+    """
     return Evaluation((
         check_mean("largest distance from the origin after 40 s over that at the start",
                    collect_values(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"

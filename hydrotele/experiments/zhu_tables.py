@@ -241,8 +241,8 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
         changes: `factor`: factor of the model parameters, 1 by default.
 
     Returns:
-        Per row, the numbers of all entries, of differing entries and of differing rotational
-        dampings `Kd`, and the largest relative difference.
+        For each compared table of the thesis: number of entries, number of entries that differ, largest
+        relative difference. Differing rotational dampings `Kd` are also counted on their own.
 
     Raises:
         InputError: `changes` has another key.

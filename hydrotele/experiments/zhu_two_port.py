@@ -142,7 +142,8 @@ def measure_delayed_channel(changes: Changes) -> Sample:
     A norm above 1 means that the channel is not passive.
 
     Args:
-        changes: `wave_impedance`: 1 for a lossless transmission line instead.
+        changes: `wave_impedance`: 0 for the delayed channel, 1 to compute `least` for a lossless
+            transmission line in its place.
 
     Returns:
         `least`: smallest norm over the delays; `lossless`: largest norm of the lossless line.

@@ -192,7 +192,7 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
 
     Args:
         buffers: LinkBuffers with the received packet in `pose`. The wrench packet is written to `reply`;
-            counters and force ramp are updated.
+            the counters, and the factor 0 to 1 by which the force fades in after a pause, are updated.
         mailbox: Mailbox; the handle's pose and the state of the control law are written to it.
         now: arrival time, scalar [ns].
         timespec: (2,) work space of the clock.

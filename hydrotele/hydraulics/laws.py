@@ -44,7 +44,7 @@ def orifice_flow(pressure_drop, flow_gain, smoothing):
 
     Args:
         pressure_drop: dp, scalar [Pa].
-        flow_gain: k = Q_rated |o| / sqrt(dp_rated), scalar [m^3/(s sqrt(Pa))].
+        flow_gain: k = Q_rated |o| / sqrt(dp_rated) with the relative valve opening o, scalar [m^3/(s sqrt(Pa))].
         smoothing: d, scalar [Pa], > 0.
 
     Returns:

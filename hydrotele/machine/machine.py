@@ -454,7 +454,7 @@ _SENSOR_KIND_OF_CHANNEL = {
 
 
 def get_sensor_set(machine: Machine, name: str) -> SensorSet | None:
-    """Return a sensor set of a machine by name; None for ideal sensors.
+    """Return a sensor set of a machine by name, and None for the name `ideal` (true values, no set).
 
     Raises:
         InputError: the machine has no such sensor set; the message lists the valid names.

@@ -506,7 +506,10 @@ def _set_limits(axes: "Axes", values: list[np.ndarray]) -> None:
 
 
 def _worst_interval(prediction: Prediction, column: int) -> tuple[float, float]:
-    """Return start and stop of 2 s around the window with the largest error of a channel (column) [s]."""
+    """Return start and end [s] of the 2 s around the largest error of a channel.
+
+    The error is the RMS over the windows of `windowed_errors`; `column` is the index of the channel.
+    """
     found = windowed_errors(prediction)
     worst = int(np.argmax(np.nan_to_num(found.rms[:, column])))
     middle = 0.5 * (found.edges[worst] + found.edges[worst + 1])

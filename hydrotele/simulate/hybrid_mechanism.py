@@ -34,7 +34,8 @@ def build_hybrid_mechanism(robot: HybridRobot) -> mujoco.MjSpec:
     """Build the closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
 
     In this pose all bodies have the axes of frame 0. Joints have the names of the robot's joints,
-    and `leg1.roll`, `leg1.pitch`, `leg1` (the slide, 0 at home) and `ball`. In the world, the x
+    and `leg1.roll` and `leg1.pitch` (universal joint at the carriage), `leg1` (the slide, 0 at home) and
+    `ball` (at the platform). In the world, the x
     axis of frame 0 points up, y to the right and z along the rails.
 
     Args:

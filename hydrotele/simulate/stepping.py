@@ -156,7 +156,9 @@ def unpack_simulation_record(r):
 
 @compiled
 def true_sensor_values(sim, out):
-    """Compute the true values of the sensed channels at the time of the activations.
+    """Compute the true values of the sensed channels, all at the time of the present chamber pressures.
+
+    MuJoCo's positions are one step later than its activations (pressures) and are moved back by one step.
 
     Args:
         sim: Simulation.
