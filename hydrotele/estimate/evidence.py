@@ -170,7 +170,10 @@ class Evidence:
             machine = guess.machine(self.data.machine)
         except DomainError:
             return Judged(guess, self.tracks, np.inf)
-        tracks = tuple(dataclasses.replace(track, levels=levels) for track in self.tracks)
+        tracks = self.map(
+            lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
+            self.tracks,
+        )
         tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)

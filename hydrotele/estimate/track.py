@@ -669,7 +669,7 @@ def _cross(
     initial = np.zeros((full, full))
     if given is not None and given.shape[1] != full:  # another number of readings on their way
         given = None
-    flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
+    flow = np.zeros((rows if linearise else 0, full, full)) if given is None else given  # the last row stays 0
     scales = state_scales(machine, names)
     variances = Variances(
         noise, state_drift(names, levels, run.period, scales), (scales * by_kind(names, STARTLE)) ** 2

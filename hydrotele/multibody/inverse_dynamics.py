@@ -131,7 +131,7 @@ def _check_table(values: np.ndarray, width: int) -> np.ndarray:
         raise InputError(_ERROR_CONTEXT, f"motion must be (n, {width}), one column per joint: {table.shape}")
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0, 0])
-        message = f"row {row} lacks a position, rate or acceleration: fill the gaps of the log or leave such rows out"
+        message = f"row {row} has no position, rate or acceleration: fill the gaps of the log or leave such rows out"
         raise InputError(_ERROR_CONTEXT, message)
     return table
 
