@@ -264,15 +264,25 @@ def take_screenshot(
         _hide_top_panel(client)
         client.set_time(TIMELINE, duration=_screenshot_time(state, displayed_time, rrd), play_state="paused")
         part.write_bytes(_take_settled_screenshot(client, rrd, deadline))
-        return _viewer_reports(client)
+        return _viewer_reports(client, rrd, deadline)
 
 
-def _viewer_reports(client: "ViewerClient") -> tuple[str, ...]:
-    """Return the warnings and errors that the viewer reports for the recording."""
-    views = client.get_state().views
+def _viewer_reports(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> tuple[str, ...]:
+    """Return the warnings and errors that the viewer reports for the recording, not those of images taken again."""
+    views = _read_state(client, rrd, deadline).views
     shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
-    entries = [e for e in client.get_logs() if e.level in ("WARN", "ERROR")]
-    return (*shown, *(e.message for e in entries if "rasterizer" not in e.message))
+    entries = [e.message for e in client.get_logs() if e.level in ("WARN", "ERROR")]
+    return (*shown, *(e for e in entries if "rasterizer" not in e and "Failed to render screenshot" not in e))
+
+
+def _read_state(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> "ViewerState":
+    """Return the state of the viewer; a busy computer without a graphics card may need several attempts."""
+    while True:
+        try:
+            return client.get_state()
+        except TimeoutError:
+            if time.monotonic() > deadline:
+                raise InputError(rrd, _TOO_SLOW) from None
 
 
 @contextlib.contextmanager
@@ -312,14 +322,14 @@ def _connect_client(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "V
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.get_state()
             return client
-        except (RuntimeError, ConnectionError):
+        except (RuntimeError, ConnectionError, TimeoutError):
             time.sleep(_POLL)
 
 
 def _wait_until_loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) -> "ViewerState":
     while True:
         _check_viewer_alive(viewer, rrd, deadline)
-        state = client.get_state()
+        state = _read_state(client, rrd, deadline)
         if not state.loading and state.recordings and state.recordings[0].timelines:
             return state
         if failed := [entry.message for entry in client.get_logs() if entry.level == "ERROR"]:

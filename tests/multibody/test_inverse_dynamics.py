@@ -237,7 +237,7 @@ def test_virtual_work_of_joints_and_pins():
 
 def test_refusals_say_what_is_wrong():
     _, chain, given, q, v, a = closed("none")
-    with pytest.raises(InputError, match="row 3 has no motion"):
+    with pytest.raises(InputError, match="row 3 has no position, rate or acceleration"):
         project_on_drives(chain, given, np.where(np.arange(400)[:, None] == 3, np.nan, q), v, a)
     with pytest.raises(InputError, match="2 joints are given but 3 have a drive"):
         project_on_drives(chain, given[:2], q[:, :2], v[:, :2], a[:, :2])
