@@ -293,12 +293,7 @@ STRAIGHT_LINE = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
-
-    `part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
-    REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
-    mjModel, mjData, TASK_PARAMETERS and the observation.
-    """
+    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -23,8 +23,11 @@ BEGIN, TICK, OBSERVE, REWARD = range(4)
 observation of the task, compute the reward of a step."""
 
 TASK_SIGNATURE = types.float64(*(types.int64,) * 6)
-"""Signature (part, mjModel*, mjData*, index of the simulation, TASK_PARAMETERS*, float32* output of
-the observation) -> reward."""
+"""Signature of the native code of a task: (part, m, d, number, argument, out) -> reward for REWARD, otherwise 0.
+
+`part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
+REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
+mjModel, mjData, TASK_PARAMETERS and the observation (float32)."""
 
 
 class SimulationView(NamedTuple):
