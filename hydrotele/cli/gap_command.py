@@ -327,13 +327,13 @@ def _run_search(
     with show_stages(f"gap {dataset.machine.name}", quiet) as progress:
         return find_gap(
             dataset, progress, effects=tuple(effects), jobs=jobs or 2, method=method, keep=keep,
-            warn=lambda text: stderr_console.print(f"[yellow]check the logs[/] {text}", soft_wrap=True),
+            warn=lambda text: stderr_console.print(f"[yellow]check the logs:[/] {text}", soft_wrap=True),
         )  # fmt: skip
 
 
 def _print(gap: Gap) -> None:
     for error in gap.initial.errors if gap.initial else ():
-        stdout_console.print(f"[yellow]check the logs[/] {error.description}", soft_wrap=True)
+        stdout_console.print(f"[yellow]check the logs:[/] {error.description}", soft_wrap=True)
     stdout_console.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
     for words in gap.unused_channels:
         stdout_console.print(f"[yellow]not used[/] {words}", soft_wrap=True)

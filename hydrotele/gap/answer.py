@@ -135,6 +135,8 @@ def answer_words(effect: NamedEffect) -> str:
     level = answer.level
     if len(level) == len(LEVELS):
         return ""
-    known = ", ".join(f"{kind} {name}" for kind, name in zip(LEVELS, level, strict=False)) or "not even the place"
+    known = ", ".join(f"{kind} {name}" for kind, name in zip(LEVELS, level, strict=False))
     laws = ", ".join(f"{e.name} {e.location} {100.0 * e.probability:.0f} %" for e in answer.explanations)
+    if not known:
+        return f"No location of {effect.name} reaches {100.0 * SURE:.0f} %. Laws: {laws}."
     return f"Determined with at least {100.0 * SURE:.0f} %: {known}. Laws: {laws}."

@@ -57,7 +57,12 @@ def compare_contenders(found: Found, named: Sequence[NamedEffect]) -> tuple[Comp
 
 
 def list_rejections(
-    found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], minor_share: float, worse: Sequence[str]
+    found: Found,
+    named: Sequence[NamedEffect],
+    details: Sequence[NamedEffect],
+    minor_share: float,
+    worse: Sequence[str],
+    min_score: float = ENTER,
 ) -> tuple[Rejection, ...]:
     """List what was tried and not named, with the test that it failed.
 
@@ -67,6 +72,7 @@ def list_rejections(
         details: effects that close too little of the gap.
         minor_share: fraction of the gap up to which an effect counts as a detail.
         worse: sentences on changes that made the held-out run worse.
+        min_score: twice the log Bayes factor above which the search accepts an effect.
 
     Returns:
         The rejections, the most plausible first.
@@ -76,17 +82,19 @@ def list_rejections(
     for (hypothesis, _), rest in zip(found.guess.parts, found.without, strict=True):
         if rest is not None and hypothesis.key not in kept:
             taken = part_taken(rest, found.judged)
-            rejections.append(Rejection(*hypothesis.key, "fraction of the missing inputs explained", taken, math.nan))
+            test = "fraction of the residual inputs' loss that it removes"
+            rejections.append(Rejection(*hypothesis.key, test, taken, math.nan))
     rejections += [Rejection(e.name, e.location, "fraction of the gap closed", e.share, minor_share) for e in details]
     if found.weak:
         hypothesis, deviation = found.weak.guess.parts[-1]
         size = float(np.max(np.abs(deviation) / hypothesis.least))
-        rejections.append(Rejection(*hypothesis.key, "size relative to the smallest relevant one", size, 1.0))
+        test = "parameter change, relative to the smallest relevant change"
+        rejections.append(Rejection(*hypothesis.key, test, size, 1.0))
     known = {h.key for h in found.guess.hypotheses} | {(r.name, r.location) for r in rejections}
     if not found.guess.parts:
         for s in found.ranking[:3]:
-            if s.hypothesis.key not in known:
-                rejections.append(Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, ENTER))
+            if s.hypothesis.key not in known and s.score < min_score:
+                rejections.append(Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, min_score))
     rejections += [Rejection("", "", sentence, math.nan, math.nan) for sentence in worse]
     return tuple(rejections)
 

@@ -28,7 +28,7 @@ from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
-from hydrotele.gap.model_search import search_model
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
 from hydrotele.gap.profiles import find_profiles, profile_words
 from hydrotele.gap.residuals import (
     believed,
@@ -56,7 +56,7 @@ from hydrotele.gap.result import (
     Verdict,
     VerdictExplanation,
 )
-from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
+from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.logs.dataset import Dataset
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
@@ -255,7 +255,10 @@ def find_gap(
         initial=initial,
         explanation=VerdictExplanation(
             compare_contenders(found, named),
-            list_rejections(found, named, details, _MINOR, [n for n in notes if "rejected" in n]),
+            list_rejections(
+                found, named, details, _MINOR, [n for n in notes if "rejected" in n],
+                MIN_LOG_BAYES_FACTOR if method == "regression" else ENTER,
+            ),
             traces,
         ),
         seconds=time.perf_counter() - begin,

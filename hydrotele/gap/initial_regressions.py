@@ -77,10 +77,10 @@ _POINTS = 400  # of a regression that a plot shows
 _BLOCK = 2.0  # s of a run whose rows are drawn together
 _UNITS = {
     "pressure": {"bar": 1e5, "MPa": 1e6, "psi": 6894.757},
-    "angle": {"degrees": math.pi / 180.0, "radians that were converted from degrees": 180.0 / math.pi},
+    "angle": {"degrees": math.pi / 180.0, "radians, converted from degrees once too often": 180.0 / math.pi},
     "length": {"mm": 1e-3},
     "position": {"mm": 1e-3},
-    "command": {"percent": 1e-2, "percent that were divided by 100 twice": 1e2},
+    "command": {"percent": 1e-2, "percent, divided by 100 once too often": 1e2},
 }
 """Kind of channel -> unit that a column may have instead -> factor to the right unit."""
 
@@ -710,7 +710,8 @@ def find_wrong_reading(problem: _Problem, now: Reading) -> tuple[Reading, GrossE
     as_logged = account_for(base[key], count, ("regular",))["regular"].explained
     sentence = (
         f"{reading.words}, the model explains {_percent(accounts[key].explained)} of the variance of the"
-        f" {balance_words(*key)}; as logged, it explains {_percent(as_logged)}."
+        f" {balance_words(*key)}; {'without this correction' if now.moves else 'as logged'}, it explains"
+        f" {_percent(as_logged)}."
     )
     own = [c for c in reading.moves if reading.moves[c] != now.moves.get(c)]
     error = GrossError(
@@ -739,16 +740,17 @@ def find_gross_factors(problem: _Problem, now: Reading) -> list[GrossError]:
         regular = accounts["regular"].explained
         if best == "unexplained":
             text = (
-                f"The model explains {_percent(regular)} of the variance of the {balance_words(*key)}, in no reading"
-                f" of the columns more: the log may be of another machine, or a large effect is missing."
+                f"The model explains {_percent(regular)} of the variance of the {balance_words(*key)}, and no"
+                " exchange of columns, sign or unit raises this. The log may be of another machine, or a large"
+                " effect is missing."
             )
             errors.append(GrossError(best, key, float(chances.max()), math.nan, regular, text))
             continue
-        fit = fit_robust(rows.measured, rows.columns, rows.low)
+        fit, (low, high) = fit_robust(rows.measured, rows.columns, rows.low), FACTOR_RANGES["regular"]
         text = (
-            f"The measured {balance_words(*key)} is {fit.value[0]:.3g} times what the machine file says; with this"
-            f" factor the model explains {_percent(accounts[best].explained)} of its variance, without it"
-            f" {_percent(regular)}. {_FACTOR_CAUSES[key[0]]}"
+            f"The measured {balance_words(*key)} is {fit.value[0]:.3g} times that of the model. The fit explains"
+            f" {_percent(accounts[best].explained)} of its variance; with a factor limited to {low:g} to {high:g} it"
+            f" explains {_percent(regular)}. {_FACTOR_CAUSES[key[0]]}"
         )
         errors.append(GrossError("factor", key, float(chances.max()), accounts[best].explained, regular, text))
     return errors

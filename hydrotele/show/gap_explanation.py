@@ -172,7 +172,7 @@ def _draw_flow(axes: "Axes", one: Regression, machine: Machine) -> None:
     _draw(axes, along * model, scale * one.points["measured"], along * line,
           scale * line if is_nominal else None, scale * (factor * line + constant))  # fmt: skip
     axes.set_title(f"{one.axis}: flow")
-    axes.set_xlabel(f"valve flow by the model [{unit}]" if is_nominal else "command [1]")
+    axes.set_xlabel(f"valve flow of the model [{unit}]" if is_nominal else "command [1]")
     axes.set_ylabel(f"velocity x area [{unit}]")
 
 
@@ -220,12 +220,12 @@ def verdict_reasons(gap: Gap) -> list[str]:
     for effect in gap.effects:
         if effect.mechanism_probability < SURE:
             texts.append(
-                f"The probability of {effect_title(effect)} is {probability_text(effect.mechanism_probability)}, below"
-                f" the {100 * SURE:.0f} % that a name needs."
+                f"The probability of {effect_title(effect)}, summed over all its forms, is"
+                f" {probability_text(effect.mechanism_probability)}; the verdict `named` requires {100 * SURE:.0f} %."
             )
     failed = failed_tests(gap)
     if gap.tests and not failed:
-        texts.append(f"All {len(gap.tests)} residual tests of the final model are passed.")
+        texts.append(f"All {len(gap.tests)} residual tests of the patched model are passed.")
     for name in failed:
         test = gap.tests[name]
         texts.append(
@@ -236,7 +236,7 @@ def verdict_reasons(gap: Gap) -> list[str]:
             texts.append(f"A learned law without a known cause closes {share_words(law.share)} of the gap.")
     if gap.size.noise_floor is None:
         texts.append(
-            "The error of a perfect model could not be computed, so that the answer does not count as complete."
+            "The prediction error of a perfect model could not be computed; the verdict can therefore not be `no_gap`."
         )
     return texts
 
@@ -246,7 +246,7 @@ def _title(effect: Any) -> str:
 
 
 def _candidate_rows(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return table rows of the candidates in the place of an effect, and of none."""
+    """Return table rows of the candidates that could replace an effect, and of none."""
     best = max((c.log_bayes_factor for c in comparison.contenders), default=1.0)
     rows = [
         {
@@ -262,13 +262,13 @@ def _candidate_rows(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _level_rows(gap: Gap) -> list[tuple[str, str, str]]:
-    """Return table rows of the levels place, family and law of each effect: effect, level with name, probability."""
+    """Return table rows of the levels location, family and law of each effect: effect, level with name, probability."""
     rows = []
     for effect, answer in zip(gap.effects, gap.answers or (), strict=bool(gap.answers)):
         place, chance = next(iter(answer["places"].items()))
         family, in_family = next(iter(answer["families"].items()))
         law, in_law = next(iter(answer["laws"].items()))
-        levels = ((f"place: {place}", chance), (f"family: {family}", in_family),
+        levels = ((f"location: {place}", chance), (f"family: {family}", in_family),
                   (f"law: {law.split(' ')[0].replace('_', ' ')}", in_law))  # fmt: skip
         for k, (words, probability) in enumerate(levels):
             rows.append((effect_title(effect) if k == 0 else "", words, probability_text(probability)))
@@ -277,7 +277,7 @@ def _level_rows(gap: Gap) -> list[tuple[str, str, str]]:
 
 def _rejection_row(rejection: Rejection) -> tuple[str, str, str, str]:
     """Return table cells: what, test, value, needed."""
-    what = _title(rejection) if rejection.name else "all changes"
+    what = _title(rejection) if rejection.name else "all effects"
     value = f"{rejection.value:.3g}" if math.isfinite(rejection.value) else "-"
     limit = f"more than {rejection.limit:.3g}" if math.isfinite(rejection.limit) else "-"
     return what, rejection.test, value, limit
@@ -288,7 +288,7 @@ def _rms(values: np.ndarray | None) -> float:
 
 
 def _trace_row(trace: InputTrace) -> tuple[str, str, str, str]:
-    """Return table cells: residual input, RMS of the given and of the corrected model, fraction explained."""
+    """Return table cells: residual input, RMS of the given and of the patched model, fraction explained."""
     given, left = _rms(trace.given), _rms(trace.remaining)
     explained = f"{100.0 * max(0.0, 1.0 - (left / given) ** 2):.0f} %" if given > 0.0 else "-"
     return lack_title(trace.balance, trace.axis), amount(given, trace.unit), amount(left, trace.unit), explained
@@ -312,9 +312,9 @@ def draw_traces(traces: tuple[InputTrace, ...]) -> bytes:
                       label="missing in the given model")  # fmt: skip
             if trace.added is not None:
                 axes.plot(trace.time, factor * trace.added, color=FITTED_COLOUR, lw=1.0,
-                          label="added by the corrected model")  # fmt: skip
+                          label="added by the patched model")  # fmt: skip
             axes.plot(trace.time, factor * trace.remaining, color=MEASURED_COLOUR, lw=0.8,
-                      label="missing in the corrected model")  # fmt: skip
+                      label="missing in the patched model")  # fmt: skip
             everything = np.concatenate([v for v in (trace.given, trace.remaining) if v is not None])
             reach = 1.3 * factor * float(np.nanquantile(np.abs(everything), 0.995)) or 1.0
             axes.set_ylim(-reach, reach)

@@ -93,7 +93,7 @@ def test_candidates_levels_and_rejections_are_tables(gap):
     assert [(r["title"], r["probability"]) for r in content["candidates"]] == [
         ("length offset of the boom", "62 %"), ("pin offset of the boom", "37 %"), ("none of them", "1 %"),
     ]  # fmt: skip
-    assert content["levels"][0][1:] == ("place: boom", "99 %")
+    assert content["levels"][0][1:] == ("location: boom", "99 %")
     assert content["levels"][2][1:] == ("law: length offset", "62 %")
     assert content["rejected"] == [
         ("viscous friction of the boom", "fraction of the gap closed", "0.004", "more than 0.02")
