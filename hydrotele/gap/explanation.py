@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.filter import _rows_later, input_sizes, input_units
+from hydrotele.estimate.filter import MEMORY, _rows_later, input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
 from hydrotele.estimate.track import COARSE, Track, steps_per_row
@@ -23,6 +23,7 @@ from hydrotele.machine.machine import Machine
 _TRACES = 4  # residual inputs that are shown: those that are the largest part of their physical limit
 _MIN_RELATIVE = 0.02  # of the largest: smaller residual inputs say nothing about the verdict
 _RIDGE = 1e-6  # of the squared change per row of an input at its estimated size: keeps the equations solvable
+_REACH = 5.0  # correlation times: the weight of a change that far away is below 1 %
 
 
 def compare_contenders(found: Found, named: Sequence[NamedEffect]) -> tuple[Comparison, ...]:
@@ -141,7 +142,8 @@ def trace_inputs(data: Dataset, given: Judged, final: Judged) -> tuple[InputTrac
 def _equivalent_inputs(given: Machine, final: Machine, track: Track) -> np.ndarray | None:
     """(n, m) inputs that change the next states as the corrected model does, by least squares; None if it does not.
 
-    Each state's change is divided by that of the inputs at their estimated sizes.
+    Each state's change is divided by that of the inputs at their estimated sizes. The inputs are averaged over the
+    correlation time of residual inputs.
     """
     if state_names(given) != state_names(final):
         return None
@@ -161,4 +163,12 @@ def _equivalent_inputs(given: Machine, final: Machine, track: Track) -> np.ndarr
     columns, change = columns[:, :, inside] / scale[inside], change[:, inside] / scale[inside]
     gram = np.einsum("nmz,nkz->nmk", columns, columns) + _RIDGE * np.eye(len(sizes))
     right = np.einsum("nmz,nz->nm", columns, change)
-    return np.linalg.solve(gram, right[:, :, None])[:, :, 0] * sizes
+    inputs = np.linalg.solve(gram, right[:, :, None])[:, :, 0] * sizes
+    return np.apply_along_axis(np.convolve, 0, inputs, _memory_weights(track.run.period, len(inputs)), mode="same")
+
+
+def _memory_weights(period: float, rows: int) -> np.ndarray:
+    """Return weights of a mean over the correlation time of residual inputs, which cannot follow faster changes."""
+    reach = min(math.ceil(_REACH * MEMORY / period), (rows - 1) // 2)
+    weights = np.exp(-np.abs(np.arange(-reach, reach + 1)) * period / MEMORY)
+    return weights / weights.sum()
