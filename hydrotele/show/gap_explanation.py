@@ -315,7 +315,7 @@ def draw_traces(traces: tuple[InputTrace, ...]) -> bytes:
                           label="added by the patched model")  # fmt: skip
             axes.plot(trace.time, factor * trace.remaining, color=MEASURED_COLOUR, lw=0.8,
                       label="missing in the patched model")  # fmt: skip
-            everything = np.concatenate([v for v in (trace.given, trace.remaining) if v is not None])
+            everything = np.concatenate([v for v in (trace.given, trace.added, trace.remaining) if v is not None])
             reach = 1.3 * factor * float(np.nanquantile(np.abs(everything), 0.995)) or 1.0
             axes.set_ylim(-reach, reach)
             axes.set_title(lack_title(trace.balance, trace.axis))
