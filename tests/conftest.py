@@ -1,8 +1,11 @@
 """What every test shares: a renderer that needs no display, and hypothesis settings."""
 
+import copy
 import ctypes
+import functools
 import importlib.util
 import os
+import pickle
 import sys
 import time
 from pathlib import Path
@@ -24,6 +27,40 @@ if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
             continue
         os.environ["MUJOCO_GL"] = _name
         break
+
+from hydrotele.core.files import models_folder  # noqa: E402
+from hydrotele.machine import machine_file  # noqa: E402
+from hydrotele.simulate import mechanism  # noqa: E402
+
+
+def _share_machines():
+    """Let tests share what is read from the package's models: a machine is read and compiled once.
+
+    Modules import these functions by name, so this has to be done before any other import.
+    """
+    read, compile_model = machine_file._read_machine, mechanism.compile_mechanism
+    shipped = models_folder()
+    read_once = functools.cache(read)
+
+    def read_shared(path, tool):
+        return (read_once if path.is_relative_to(shipped) else read)(path, tool)
+
+    @functools.lru_cache(maxsize=50)  # models of 1 to 20 MB
+    def compile_once(pickled):
+        return compile_model(*pickle.loads(pickled))
+
+    @functools.wraps(compile_model)
+    def compile_shared(machine, timestep=1e-3, ground=True, visuals=True, surroundings=()):
+        arguments = (machine, timestep, ground, visuals, surroundings)
+        files = [Path(machine.folder, name) for name in (machine.mjcf or "", *machine.attached.values())]
+        if not all(file.is_relative_to(shipped) for file in files):
+            return compile_model(*arguments)
+        return copy.copy(compile_once(pickle.dumps(arguments)))
+
+    machine_file._read_machine, mechanism.compile_mechanism = read_shared, compile_shared
+
+
+_share_machines()
 
 # No deadline: the first example pays for numba's compilation. The same examples each time, so
 # that a red run can be repeated.

@@ -54,7 +54,7 @@ class StageFit:
         names: the p identified parameters.
         identifiability: identifiability of the candidate parameters of this stage.
         hold_reasons: reason why a candidate keeps its nominal value, by parameter name.
-        iterations: number of Levenberg-Marquardt iterations.
+        iterations: number of iterations of the search.
         poses: number of poses.
         rms: root mean square of both equations' residuals [m].
         chi: RMS residual over its value expected from sensor noise [1]; 1 without other errors.
@@ -118,7 +118,7 @@ def sort_stages(loop: CalibrationLoop, stages: Sequence[Poses]) -> list[Poses]:
     """Sort stages, each the poses of one moving link, from the outermost link to the chassis.
 
     Raises:
-        InputError: a link cannot be calibrated, or two stages move the same link.
+        InputError: a moving link is not a powered link of the chain, or two stages move the same link.
     """
     links = loop.links[: loop.powered_count]
     for poses in stages:
@@ -143,6 +143,9 @@ def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
     Returns:
         Names such as `alpha.boom`, the most preferred first. If only a combination of several
         parameters is identifiable, the first of them is identified and the others keep their values.
+        All links have the ball's coordinates (`p_xy`, `p_z`) and their own D-H parameters. For the
+        outermost powered link the calibrator's parameters follow, otherwise the held angle of the
+        next outer link.
     """
     place = loop.links.index(link)
     first = [f"p_xy.{link}", f"p_z.{link}"]
@@ -165,8 +168,9 @@ def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
 def expected_parameter_error(loop: CalibrationLoop, name: str) -> float:
     """Return the expected error of a parameter's nominal value before calibration [rad] or [m].
 
-    It is larger for parameters measured on the machine than for those of the calibrator's links,
-    which are measured in a laboratory.
+    It is 0.1 m or 5 deg for parameters measured on the machine, and 1 mm or 0.05 deg for those
+    measured in a laboratory. The latter are the parameters of all calibrator links but the first,
+    except the sensor offsets (`offset`) of links before the last one.
     """
     kind, _, link = name.partition(".")
     known = loop.links[loop.powered_count + 1 :]
@@ -176,9 +180,10 @@ def expected_parameter_error(loop: CalibrationLoop, name: str) -> float:
 
 
 class StageEquations:
-    """The two residual equations of each of M poses while one link moves.
+    """The two residual equations of each of M poses while one link of a manipulator moves.
 
-    The ball keeps its distance p_xy from the moving joint's axis and its height p_z along that axis.
+    The calibrator's end, a ball joint on the chassis (the ball), keeps its distance p_xy from the
+    moving joint's axis and its height p_z along that axis.
     """
 
     MIN_DEVIATION = 1.0e-4
@@ -220,7 +225,8 @@ class StageEquations:
         """Return the two errors of every pose (M, 2) [m], for parameters given by name.
 
         They are the ball's distance from the moving joint's axis minus the parameter p_xy, and its
-        height along this axis minus the parameter p_z. Known drift of held links is subtracted.
+        height along this axis minus the parameter p_z. If the poses have a known drift of held links,
+        the displacement of the ball that it causes is subtracted.
         """
         loop, theta = self.chain_and_angles(parameters)
         return self._error(ball_position_from_axis(loop, self.place, theta), parameters)
@@ -274,7 +280,9 @@ class StageEquations:
     def whitening_factors(self, by_readings: np.ndarray) -> np.ndarray:
         """Return matrices (M, 2, 2) that scale the two residuals of each pose to unit covariance.
 
-        The covariance follows from the noise of the S readings and the derivatives `by_readings` (M, 2, S).
+        The covariance follows from the noise of the S calibrator readings and the derivatives
+        `by_readings` (M, 2, S) of the residuals by them [m/rad]. The square of 0.1 mm is added to both
+        variances.
         """
         spread = by_readings * self.poses.sigma[..., None, :]
         covariance = spread @ spread.transpose(0, 2, 1) + self.MIN_DEVIATION**2 * np.eye(2)
@@ -284,13 +292,14 @@ class StageEquations:
 def initial_parameters(loop: CalibrationLoop, stages: Sequence[Poses]) -> ParameterValues:
     """Compute the start values of all parameters of an arm identification.
 
-    Link parameters are nominal. Held angles are the median readings of the manipulator's sensors if
-    it has any, otherwise the home angles. The ball positions are computed from each stage's readings
-    and the nominal chain.
+    Link parameters are nominal. The angle at which a link is held is the median reading of its joint's
+    sensor, in the stage of the outermost link nearer to the chassis that has such readings. Without
+    readings it is the home angle. The ball's coordinates `p_xy` and `p_z` of each stage are means
+    over its poses, computed with the nominal chain.
 
     Args:
         loop: the nominal chain.
-        stages: the poses.
+        stages: the poses, one item per moving link.
 
     Returns:
         Parameter values by name [rad] or [m].
@@ -354,8 +363,9 @@ def classify_candidates(
 ) -> Identifiability:
     """Classify the candidate parameters `names` of a stage: identifiable or not.
 
-    A parameter is identifiable alone, only in a combination with others, or not at all. The stage's
-    equations are linearised at the values `parameters`, by name.
+    A parameter is identifiable alone, only in a combination with others, or not at all. The
+    criterion is a standard deviation, due to sensor noise, below half of the expected error of the
+    nominal value. The stage's equations are linearised at the values `parameters`, by name.
     """
     loop = equations.loop
     _, by, sensed = equations.residual_and_jacobian(parameters)
@@ -386,10 +396,10 @@ def identify_stage(
 
     Returns:
         (result of the stage, values of all parameters, covariance (q + p, q + p) of earlier and own
-        parameters).
+        parameters). Errors of the earlier parameters are propagated to the own ones.
 
     Raises:
-        InputError: there are too few poses.
+        InputError: there are fewer than two equations per parameter; each pose gives two.
     """
     poses, loop = equations.poses, equations.loop
     if 2 * len(poses) < _MIN_EQUATIONS_PER_PARAMETER * len(own_names):
@@ -447,7 +457,11 @@ def identify_stage(
 
 
 def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationLoop) -> str:
-    """Return the reason why a candidate parameter keeps its nominal value, as a short text."""
+    """Return the reason why a candidate parameter keeps its nominal value, as a short text.
+
+    It is known more accurately from the laboratory, has no effect, or is identifiable only together
+    with other parameters, which the text names.
+    """
     kind, _, link = name.partition(".")
     if (
         link in loop.links[loop.powered_count + 1 :]
@@ -465,8 +479,18 @@ def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationL
 def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> ArmFit:
     """Build the result of an arm calibration from the values and covariance of its parameters.
 
-    The calibrated chain gets the identified ball position, if the link nearest to the chassis moved
-    in one of the stages.
+    Args:
+        loop: the nominal chain.
+        parameters: all parameters after calibration, by name.
+        start: all parameters before calibration, by name.
+        names: the p identified parameters.
+        covariance: (p, p) their covariance.
+        stages: results of the moving links.
+        method: `hierarchical` or `joint`.
+
+    Returns:
+        The result. Its calibrated chain has the identified distance and height of the ball, if
+        those of the link nearest to the chassis were identified.
     """
     values = {name: parameters[name] for name in loop.parameter_names}
     calibrated = loop.with_values(values)
@@ -486,9 +510,9 @@ def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> 
 def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     """Refit the parameters of all stages together, starting from the link-by-link fit.
 
-    A parameter enters the equations of every stage that depends on it; each stage has its own ball
-    position. The Jacobian is sparse: a stage does not depend on the links between the chassis and
-    its moving link.
+    A stage is the set of poses recorded while one link moves. A parameter enters the equations of
+    every stage that depends on it; each stage has a separate ball position. The Jacobian is sparse: a
+    stage does not depend on the links between the chassis and its moving link.
 
     Args:
         fit: the link-by-link (hierarchical) fit.
@@ -556,7 +580,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
 
 
 def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
-    """Raise InputError if readings are not finite, or no calibrator joint moves by 2 deg or more."""
+    """Raise InputError if a calibrator reading is not finite, or all calibrator joints move by less than 2 deg."""
     bad = np.argwhere(~np.isfinite(poses.theta))
     if len(bad):
         row, column = bad[0]
@@ -572,10 +596,10 @@ def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
 
 
 def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
-    """Compute the two errors of each pose of a stage, whitened by the sensor noise.
+    """Compute the two errors of each pose of a stage (one moving link), whitened by the sensor noise.
 
-    The errors are the ball's distance from the moving axis and its height along it, each minus its
-    value in the parameters.
+    The errors are the distance of the calibrator's end (the ball) from the moving joint's axis and its
+    height along it, each minus its value in the parameters.
 
     Args:
         loop: the nominal chain.

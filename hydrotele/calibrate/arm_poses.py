@@ -15,8 +15,9 @@ class Drift(NamedTuple):
     Attributes:
         held: (M,) deviation of each held link beyond the moving one from its mean angle [rad],
             by link name.
-        ball: (M, 3) displacement of the ball away from, along and around the moving joint's axis
-            [m], caused by drift of the links inside the moving one.
+        ball: (M, 3) displacement of the ball from its mean position, away from, along and around
+            the moving joint's axis [m]. It is caused by drift of the links between the chassis and
+            the moving link.
     """
 
     held: Mapping[str, np.ndarray]
@@ -31,13 +32,13 @@ class Poses:
 
     Attributes:
         link: the moving link.
-        theta: (M, S) readings of the calibrator's sensors, without offsets [rad].
+        theta: (M, S) readings of the calibrator's sensors [rad]; the offset parameters are not added.
         sigma: (S,), or (M, S) if it depends on the pose: standard deviation of a reading [rad].
         manipulator: (M,) readings of the manipulator's own joint sensors, if any, by link [rad];
             the identification itself does not use them.
         manipulator_sigma: standard deviation of such a reading [rad].
         source: origin of the readings, for messages.
-        rows: (M,) rows of the source.
+        rows: (M,) row numbers of the poses in the source.
         drift: drift of the held links; None if they are fixed.
     """
 
@@ -74,10 +75,10 @@ _TREND_DEGREE = 2  # polynomial degree over the poses: leakage decreases while p
 def add_held_link_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
     """Estimate how held links drift during a measurement, and add this drift to the poses.
 
-    The drift is a polynomial of degree 2 through the readings of the manipulator's own sensors.
-    Only changes of the readings are used, so sensor offsets have no effect. Drift of links between
-    the chassis and the moving one displaces the ball in the moving link's frame. This displacement
-    is computed with the nominal chain.
+    The drift of a link is a polynomial of degree 2, fitted to the readings of its joint's sensor
+    over the poses, minus the mean reading. Drift of links between the chassis and the moving one
+    displaces the ball in the moving joint's frame. This displacement is computed with the nominal
+    chain.
 
     Args:
         loop: the nominal chain.

@@ -41,15 +41,15 @@ _MAX_REMOVED_FRACTION = 0.7  # maximum fraction of a stage's poses that may be l
 
 
 class CorruptedRegion(NamedTuple):
-    """Sequence of poses of a stage with corrupted readings.
+    """Sequence of poses with corrupted readings in a stage, the poses while one link moves.
 
     Attributes:
         link: the moving link.
-        first: first pose.
-        last: last pose, included.
-        joint: the joint whose sensor is wrong; empty for the moving link's own sensor.
-        size: root mean square of its error [rad].
-        explained: fraction of the region's squared residual that this joint explains [1].
+        first: index of the first pose in the stage.
+        last: index of the last pose, included.
+        joint: the calibrator joint whose sensor is wrong; empty for the moving link's own sensor.
+        size: root mean square error of this sensor [rad].
+        explained: fraction of the region's squared residual that this sensor's error explains [1].
         possible: all joints that the poses do not exclude, the most likely first; joints whose
             axes are parallel in all poses of a region cannot be distinguished.
     """
@@ -68,8 +68,9 @@ class CleanedFit(NamedTuple):
 
     Attributes:
         fit: hierarchical fit of the remaining poses.
-        stages: the remaining poses.
-        regions: the poses that were left out.
+        stages: the remaining poses, by moving link.
+        regions: the sequences of poses with corrupted readings. Their poses were left out, except
+            where only the moving link's own sensor is wrong (`joint` is empty).
     """
 
     fit: ArmFit
@@ -104,18 +105,19 @@ def whitened_residuals(
     parameters: Mapping[str, float],
     known: ParameterUncertainty | None = None,
 ) -> WhitenedResiduals:
-    """Compute the residuals of a stage's poses, scaled to unit variance by the sensor noise.
+    """Compute the residuals of a stage's poses (one moving link), scaled to unit variance by the sensor noise.
 
-    Each pose has the equations of the ball's distance and height, and that of its angle about the
-    moving axis if that joint has a sensor. The angle equation is not part of the identification.
-    Residuals due to parameter uncertainty are removed: the parameters are moved within their
-    covariance to fit the majority of the poses.
+    Each pose has the equations of the distance of the calibrator's end (the ball) from the moving
+    joint's axis and of its height along it. If that joint has a sensor, the equation of the ball's
+    angle about the axis is added, which is not part of the identification. Residuals due to parameter
+    uncertainty are removed: the parameters are moved within their covariance to fit the majority of
+    the poses.
 
     Args:
         loop: the nominal chain.
         poses: poses of the stage.
-        parameters: parameters of a fit.
-        known: uncertainty of its parameters; None to take them as exact.
+        parameters: parameter values of a fit, by name.
+        known: names and covariance of the uncertain parameters; None to take all as exact.
 
     Returns:
         Residuals and derivatives, whitened.
@@ -162,7 +164,8 @@ def _remove_parameter_errors(rows: np.ndarray, slopes: np.ndarray, covariance: n
         covariance: (p, p) covariance of the parameters.
 
     Returns:
-        (M, E) remaining residuals. Poses with outlying residuals do not affect the parameter change.
+        (M, E) remaining residuals. Poses whose squared residual exceeds 16 times its typical value
+        do not affect the parameter change. For E = 3 the unknown zero of the angle is removed, too.
     """
     root = np.linalg.cholesky(covariance + 1.0e-18 * np.eye(len(covariance)))
     scaled = slopes @ root
@@ -188,10 +191,11 @@ def find_corrupted_regions(
 ) -> list[CorruptedRegion]:  # fmt: skip
     """Find sequences of poses (regions) whose residuals are too large to be sensor noise.
 
-    A score, the squared residuals of a pose minus twice their expected value, is summed along the
-    poses. Ranges of poses with the largest sums are regions if the sum exceeds a threshold. Noise
-    alone exceeds it in a fraction `false_alarm` of the measurements (extreme value of a random walk
-    with negative drift).
+    A score is summed along the poses: the squared residual of a pose minus twice its expected value.
+    If the median squared residual exceeds that of sensor noise, squared residuals are first divided
+    by this ratio. Ranges of poses with the largest sums are regions if the sum exceeds a threshold.
+    Noise alone exceeds it in a fraction `false_alarm` of the measurements (extreme value of a random
+    walk with negative drift).
 
     Args:
         loop: the nominal chain.
@@ -223,7 +227,11 @@ def find_corrupted_regions(
 
 
 def _find_high_segments(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """Return disjoint ranges (first, last index) with the largest sums of scores, each above a threshold."""
+    """Return disjoint ranges (first, last index) with the largest sums of scores, each above a threshold.
+
+    The range with the largest sum is found first, then those in the parts before and after it. The
+    last index is included.
+    """
     found: list[tuple[int, int]] = []
     waiting = [(0, len(score))]
     while waiting:
@@ -236,7 +244,7 @@ def _find_high_segments(score: np.ndarray, threshold: float) -> list[tuple[int, 
 
 
 def _max_sum_segment(score: np.ndarray) -> tuple[float, int, int]:
-    """Return sum, first and last index of the contiguous range with the largest sum."""
+    """Return sum, first and last index (included) of the contiguous range of scores with the largest sum."""
     best, first, last = -np.inf, 0, -1
     run, begin = 0.0, 0
     for k, value in enumerate(score):
@@ -251,7 +259,12 @@ def _max_sum_segment(score: np.ndarray) -> tuple[float, int, int]:
 def _attribute_region_to_joint(
     loop: CalibrationLoop, poses: Poses, found: WhitenedResiduals, first: int, last: int
 ) -> CorruptedRegion:
-    """Build the region of poses `first` to `last`, and find the joint whose sensor error explains it best."""
+    """Build the region of poses `first` to `last`, and find the joint whose sensor error explains it best.
+
+    Each joint's error in every pose is fitted to the residuals `found`. The selected calibrator joint
+    leaves the smallest squared residual. The moving link's own sensor is selected instead only if
+    the squared residual that it leaves is smaller by more than 20.
+    """
     inside = slice(first, last + 1)
     rows = found.rows[inside]
     whole = float(np.sum(rows**2))
@@ -281,13 +294,14 @@ def identify_without_bad_data(
 ) -> CleanedFit:
     """Identify the arm link by link without corrupted poses, which are found in each stage first.
 
-    A stage with regions is first refitted to its poses with the smallest residuals, so that a fit
-    to corrupted poses does not mask them. Regions in which only the manipulator's own sensor is
-    wrong are kept, because the identification does not use that sensor.
+    Regions are sequences of poses whose residuals are too large to be sensor noise. A stage with
+    regions is first refitted to its poses with the smallest residuals, so that a fit to corrupted
+    poses does not mask them. Poses of regions in which only the moving link's own sensor is wrong
+    stay in the fit, because the identification does not use that sensor.
 
     Args:
         loop: the nominal chain.
-        stages: all poses.
+        stages: all poses, one item (stage) per moving link.
         false_alarm: probability of a region in a measurement without corruption.
 
     Returns:
@@ -340,13 +354,25 @@ def identify_without_bad_data(
 
 
 def _refit_until_regions_stable(loop, poses, solve, found, total, false_alarm, names, own):
-    """Alternate between the fit and the search for corrupted regions until the regions stay the same.
+    """Alternate between the fit of a stage and the search for corrupted regions until the regions stay the same.
 
-    The first fits use only the poses with the smallest residuals. The search also ends after eight
-    rounds, or if more than 70 % of the poses would be removed.
+    The first three fits use only the poses with the smallest residuals, at least 60 %. The search
+    also ends after eight rounds, or before a fit from which more than 70 % of the poses would be
+    removed.
+
+    Args:
+        loop: the nominal chain.
+        poses: all poses of the stage.
+        solve: function of a mask of poses, and whether the start is close, to a fit as returned by
+            `identify_stage`.
+        found: fit of all poses, as returned by `solve`.
+        total: number of poses of the whole measurement.
+        false_alarm: probability of a region in a measurement without corruption.
+        names: names of the parameters identified in this and earlier stages.
+        own: names of the parameters identified in this stage.
 
     Returns:
-        (last fit, as returned by `identify_stage`; list of corrupted regions).
+        (last fit, as returned by `solve`; the regions whose poses it omits).
     """
     for _ in range(3):
         known = ParameterUncertainty(names, found[2])
@@ -384,8 +410,8 @@ def predict_reading_from_others(loop: CalibrationLoop, poses: Poses, parameters:
         parameters: parameters of a fit.
 
     Returns:
-        (M, S) readings [rad]: for each sensor the value that best satisfies the pose's equations
-        while the other sensors keep their readings.
+        (M, S) readings [rad]: for each sensor the value that best satisfies the pose's equations,
+        linearised at the readings, while the other sensors keep their readings.
     """
     found = whitened_residuals(loop, poses, parameters)
     length = np.maximum(np.sum(found.by_readings**2, axis=1), 1.0e-12)

@@ -31,7 +31,9 @@ _KIND_COLUMNS = {kind: k for k, kind in enumerate(PARAMETER_KINDS)}
 
 @dataclass(frozen=True)
 class CalibrationLoop:
-    """A closed chain of N links with its ball joint.
+    """Closed chain of N links: a manipulator and a calibrator, which ends at a ball joint on the chassis.
+
+    Parameters and signs are those of Khoshzaban's (K) D-H convention.
 
     Attributes:
         joints: (N,) names of the joints, from the chassis outwards.
@@ -96,7 +98,7 @@ def unit_of(name: str) -> str:
 
 
 def link_chain(values: np.ndarray) -> SerialChain:
-    """Build the serial chain of consecutive links; its joint coordinates are angles with offsets.
+    """Build the serial chain of consecutive links; its joint coordinates are sensor angles plus offsets.
 
     Args:
         values: (k, 5) rows of `CalibrationLoop.values`; the offsets are not used.
@@ -143,7 +145,7 @@ def frame_after_links(loop: CalibrationLoop, count: int, theta: np.ndarray) -> t
 
 
 def ball_position_from_axis(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.ndarray:
-    """Compute the ball position in the frame of joint axis `first`, without that joint's angle.
+    """Compute the chain's end (the ball) in the frame of joint axis `first`, with that joint's angle set to 0.
 
     Args:
         loop: the chain.
@@ -151,7 +153,7 @@ def ball_position_from_axis(loop: CalibrationLoop, first: int, theta: np.ndarray
         theta: (M, N - first - 1) angles of the joints beyond it, with their offsets [rad].
 
     Returns:
-        (M, 3) positions [m], z along the axis.
+        (M, 3) positions [m], z along the axis, including the length d of the joint's own link.
     """
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
     return chain_poses(link_chain(loop.values[first:]), angles).position
@@ -160,7 +162,7 @@ def ball_position_from_axis(loop: CalibrationLoop, first: int, theta: np.ndarray
 def ball_position_and_derivatives(
     loop: CalibrationLoop, first: int, theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the ball position in the frame of a joint axis, and its derivatives by link parameters.
+    """Compute the chain's end (the ball) in the frame of a joint axis, and its derivatives by link parameters.
 
     The joint's own angle is taken as 0.
 
@@ -183,7 +185,7 @@ def ball_position_and_derivatives(
 
 
 def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the vector from the ball to the end of the chain, and its derivatives by the joint angles.
+    """Compute the vector from the ball joint to the end of the chain, and its derivatives by the joint angles.
 
     Args:
         loop: the chain.
@@ -207,9 +209,10 @@ def solve_closing_angles(
 
     Args:
         loop: the chain.
-        theta: (M, N) angles [rad]; those of `free` are not used.
+        theta: (M, N) angles with offsets [rad]; those of `free` are not used.
         free: indices of the three joints.
         start: (3,) start angles of the first pose, or (M, 3) of all poses, near the solution [rad].
+            With (3,), each further pose starts from the last pose that closes.
 
     Returns:
         (theta (M, N) closed to 1e-9 m, reached (M,) whether each pose closes).
@@ -231,7 +234,7 @@ def solve_closing_angles(
 
 
 def _close_by_newton(loop: CalibrationLoop, theta: np.ndarray, free: list[int]) -> np.ndarray:
-    """Change the `free` angles of theta (M, N) in place so that the chain ends at the ball.
+    """Change the three angles `free` of theta (M, N) in place so that the chain ends at the ball.
 
     Returns:
         (M,) whether each row closes to 1e-9 m.
@@ -316,6 +319,8 @@ def _denavit_hartenberg(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the D-H parameters (N, 5) of N joint axes, and the origin of frame 0 (3,) [m].
 
+    The columns are offset, alpha, a, d, beta [rad] or [m].
+
     Args:
         directions: (N, 3) unit vectors of the axes in the machine's frame.
         points: (N, 3) points on the axes [m].
@@ -365,7 +370,8 @@ def _denavit_hartenberg(
 def _perpendicular_axes(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors perpendicular to a direction `way` and to each other.
 
-    The first is the machine's x axis (or z axis, if the direction is near x) projected across it.
+    The first is the machine's x axis, projected on the plane perpendicular to `way` and normalised.
+    If `way` is near the x axis, the z axis is projected instead.
     """
     x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = x - way * (way @ x)
@@ -393,7 +399,8 @@ def solve_calibrator_angles(loop: CalibrationLoop, theta: np.ndarray) -> tuple[n
         theta: (M, N) angles with offsets; those of the last three joints are not used [rad].
 
     Returns:
-        (theta (M, N) closed to 1e-9 m, reached (M,); rows that are not reached hold no solution).
+        (theta (M, N) closed to 1e-9 m, reached (M,) whether each pose closes; the other rows of theta
+        hold no solution).
     """
     theta = theta.copy()
     first = len(loop) - 3

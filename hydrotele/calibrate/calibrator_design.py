@@ -66,7 +66,12 @@ class Design(NamedTuple):
 
 
 class DesignSurvey(NamedTuple):
-    """Evaluated calibrator designs over a grid of arm and forearm lengths, and the present design."""
+    """Evaluated calibrator designs over a grid of arm and forearm lengths.
+
+    Attributes:
+        designs: the designs of the grid.
+        present: the design with the lengths of the calibrator in the given chain.
+    """
 
     designs: tuple[Design, ...]
     present: Design
@@ -89,7 +94,8 @@ def evaluate_calibrator_design(
         max_angle_error: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
-        The design with its figures of merit.
+        The design with its figures of merit. If fewer than half of the poses of a link are in reach,
+        the tip error is 1000 m and the information is minus infinity.
     """
     values = loop.values.copy()
     values[-2, 3], values[-1, 2] = arm, forearm
@@ -137,9 +143,9 @@ def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[
 
 
 def _tip_position_std(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
-    """Return the uncertainty of the arm's tip position due to a parameter covariance (p, p) [m].
+    """Return the uncertainty of the arm's tip position due to the covariance (p, p) of parameters `names` [m].
 
-    It is the root mean square standard deviation over five arm poses.
+    It is the square root of the mean, over five arm poses, of the trace of the position's covariance.
     """
     count = loop.powered_count - 1
     chain = link_chain(loop.values[:count])
@@ -158,14 +164,15 @@ def _tip_position_std(loop: CalibrationLoop, names: list[str], covariance: np.nd
 
 
 def evaluate_design_grid(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
-    """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint at its present place.
+    """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint as in the given chain.
 
     Args:
         loop: the nominal chain.
         accuracy: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
-        The designs, ordered by forearm length, and the design of the present calibrator.
+        The designs, ordered by forearm length and then arm length, and the design of the calibrator
+        in the given chain.
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
     grid = [
@@ -186,12 +193,13 @@ def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float
 
     Args:
         loop: the nominal chain.
-        survey: grid of designs, the best of which starts the search.
+        survey: grid of designs. The search starts from the one with the smallest tip error that
+            reaches 98 % of the poses.
         accuracy: largest error of an angle sensor, uniformly distributed [rad].
 
     Returns:
-        The design; the ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
-        and 1.3 to 0.6 m below the boom pin.
+        The design. The ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
+        and 1.3 to 0.6 m below the boom pin. The arm is 1.5 to 4.8 m long, the forearm 1.5 to 5.2 m.
     """
     reaching = [d for d in (*survey.designs, survey.present) if d.reached >= _MIN_REACHED_FRACTION]
     start = min(reaching or [survey.present], key=lambda d: d.tip_error)

@@ -37,9 +37,9 @@ def read_calibration_poses(
         machine: the machine with its calibrator.
         loop: the closed chain of this machine and its calibrator.
         max_poses: maximum number of poses per log.
-        accuracy: standard deviation of an angle reading [rad]; by default that of the sensor set
-            named in the log, otherwise that of resolvers with errors within 0.1 deg (Khoshzaban
-            1992).
+        accuracy: standard deviation of an angle reading [rad]. By default it is that of the sensor
+            set named in the log, otherwise 0.1 deg / sqrt(3), for resolvers with uniformly
+            distributed errors within 0.1 deg (Khoshzaban 1992).
 
     Returns:
         One set of poses per log, in the order of the files.
@@ -91,9 +91,9 @@ def log_to_poses(
         machine: the machine with its calibrator.
         loop: the closed chain of this machine.
         max_poses: maximum number of poses.
-        accuracy: standard deviation of an angle reading [rad]; None for that of the sensor set
-            named in the log, otherwise that of resolvers with errors within 0.1 deg (Khoshzaban
-            1992).
+        accuracy: standard deviation of an angle reading [rad]. None for that of the sensor set
+            named in the log, otherwise 0.1 deg / sqrt(3), for resolvers with uniformly distributed
+            errors within 0.1 deg (Khoshzaban 1992).
 
     Returns:
         The poses, evenly spaced over the valid rows.
@@ -131,7 +131,7 @@ def _angle_noise_std(log: Log, machine: Machine, channel: str, accuracy: float |
     """Return the noise of an angle channel's readings, a standard deviation [rad].
 
     It is `accuracy` if given, otherwise that of the sensor set named in the log. If the log names
-    none, it is that of a resolver with errors within 0.1 deg.
+    none, it is 0.1 deg / sqrt(3), for a resolver with uniformly distributed errors within 0.1 deg.
     """
     if accuracy is not None:
         return accuracy
@@ -145,7 +145,10 @@ def _angle_noise_std(log: Log, machine: Machine, channel: str, accuracy: float |
 def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
     """Find the name of the powered link that moves in a log while the others are held.
 
-    It is found from joint angles, else from cylinder lengths or commands, else from the file name.
+    A link moves if its joint angle changes by more than 1 deg. If no angle shows a motion, the link
+    with the largest change of cylinder length (over 0.02 m) is taken, or else of command (over 0.1).
+    If channels of one kind are logged for all links and none moves, no link moves. Otherwise the
+    file name must contain the link.
 
     Args:
         log: the log.
@@ -155,7 +158,8 @@ def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
         The name of the link.
 
     Raises:
-        InputError: no link or more than one link moves, or the log does not determine the link.
+        InputError: no link moves, the angles of more than one link move, or neither channels nor
+            file name determine the link.
 
     >>> from hydrotele.machine.machine_file import load_machine
     >>> from hydrotele.calibrate.calibration_loop import build_loop
@@ -186,11 +190,11 @@ def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
 
 
 def split_poses(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list[Poses]]:
-    """Split the poses of each stage into a fitting set and a validation set.
+    """Split the poses of each stage (one moving link) into a fitting set and a validation set.
 
     Args:
-        stages: all poses.
-        every: every n-th pose of a stage is used for validation; 0 or 1 for no validation set.
+        stages: all poses, one item per moving link.
+        every: n; every n-th pose of a stage is used for validation; 0 or 1 for no validation set.
 
     Returns:
         (stages for fitting, stages for validation).
@@ -209,7 +213,7 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], max_samples
         log: log with channels `angle.AXIS` and `length.AXIS`.
         machine: the machine.
         axes: names of the axes to search.
-        max_samples: maximum number of samples; 0 for all.
+        max_samples: maximum number of samples per axis, evenly spaced; 0 for all.
 
     Returns:
         One item per axis that moves by at least 5 deg.
@@ -237,8 +241,8 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], max_samples
 def _length_noise_std(log: Log, machine: Machine, channel: str) -> float:
     """Return the noise of a displacement channel's readings, a standard deviation [m].
 
-    It is that of the sensor set named in the log. If the log names none, it is that of a transducer
-    with errors within 2 mm.
+    It is that of the sensor set named in the log. If the log names none, it is 2 mm / sqrt(3), for a
+    transducer with uniformly distributed errors within 2 mm.
     """
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL_SENSORS:

@@ -151,8 +151,10 @@ def least_squares(
         truncation: decreasing thresholds, relative to the largest singular value, below which
             directions of a step are omitted; each is used until convergence (`TRUNCATION_LEVELS`). None
             for SciPy's Levenberg-Marquardt search.
-        select: which parameters are held: those without any effect (`structure`), also those whose
-            effect is below the noise (`noise`), or `none`.
+        select: which parameters are held at their start values. `structure`: those that even
+            noise-free equations do not determine, except those with a prior; of an identifiable
+            combination one parameter is fitted and the others are held. `noise`: also those whose
+            effect is below the noise. `none`: no parameter.
         preferred: parameters preferred as representatives of combinations.
         max_iterations: maximum number of iterations.
 
@@ -326,7 +328,10 @@ class _SearchState:
 
 
 class _Problem:
-    """Residual and Jacobian of all parameters, with input checks."""
+    """Residuals (m,) of a least-squares problem and their Jacobian (m, p) by all p parameters.
+
+    The constructor raises InputError if names, start values and scales do not match.
+    """
 
     def __init__(self, residual, start, names, scales, jac, sparsity) -> None:
         self.start, self.scales = np.array(start, float), np.array(scales, float)
@@ -344,7 +349,10 @@ class _Problem:
         self.groups = np.arange(p) if self.hits is None else _group_columns(self.hits)
 
     def residual_vector(self, x: np.ndarray) -> np.ndarray:
-        """Return the residuals (m,) at parameters x (p,); raise InputError if one is not finite."""
+        """Return the residuals (m,) at parameters x (p,); raise InputError if one is not finite.
+
+        Residuals of complex x (for complex-step derivatives) are returned without checks.
+        """
         rows = np.asarray(self.residual(x))
         if np.iscomplexobj(x):
             return rows
@@ -414,9 +422,9 @@ def _group_columns(sparsity: np.ndarray) -> np.ndarray:
 
 
 class _ScaledProblem:
-    """A least-squares problem in its free parameters over their scales, with weights and priors.
+    """A least-squares problem whose unknowns are the free parameters, divided by their scales.
 
-    Each free parameter with a prior adds one row to the residuals.
+    Equations are weighted. Each free parameter with a prior adds one row to the residuals.
     """
 
     def __init__(self, problem: _Problem, weight, prior: Prior | None, free) -> None:
@@ -517,8 +525,17 @@ def _minimize_truncated(
 
     The threshold of a small singular value starts high and is lowered after each convergence.
 
-    A step that does not reduce the residual is halved. If halving fails, or a step is small, the
-    next threshold follows.
+    A step that does not reduce the sum of squares is halved, up to 12 times. If halving fails, or a
+    step is below 1e-10 of the scales, the search continues with the next threshold.
+
+    Args:
+        search: the scaled problem.
+        begin: end of a previous search, the start of this one.
+        thresholds: decreasing thresholds, relative to the largest singular value.
+        max_steps: maximum number of steps per threshold.
+
+    Returns:
+        The end of this search.
     """
     x, problem = begin.x, search.problem
     rows = search.weighted_residual(x)

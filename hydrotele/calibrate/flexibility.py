@@ -31,7 +31,8 @@ class Flexibility(NamedTuple):
 
     Attributes:
         joints: names of the S joints.
-        at_full_load: (S,) standard deviation of the angle error at full load [rad].
+        at_full_load: (S,) standard deviation of the angle error at full load [rad]. Full load is a
+            horizontal distance from joint to ball that equals the maximum reach.
         log_likelihood_gain: increase in log likelihood over a model without flexibility [1].
     """
 
@@ -79,11 +80,11 @@ def add_flexibility_to_noise(loop: CalibrationLoop, poses: Poses, fit: ArmFit, f
 
 
 def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: ArmFit) -> Flexibility:
-    """Estimate the joints' flexibility by maximum likelihood, with fixed arm parameters.
+    """Estimate the flexibility of the calibrator's joints by maximum likelihood, with fixed arm parameters.
 
     Args:
         loop: the nominal chain.
-        stages: poses with the sensors' own standard deviations (S,).
+        stages: poses, one item per moving link, with the sensors' own standard deviations (S,).
         fit: fit of these poses.
 
     Returns:
@@ -121,7 +122,10 @@ def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: Ar
 def refit_with_flexibility(
     loop: CalibrationLoop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
 ) -> tuple[ArmFit, Flexibility]:
-    """Estimate the calibrator's joint flexibility and the arm parameters in turn, three times.
+    """Refit the arm parameters with the bending of the calibrator's joints in the noise model.
+
+    The joint flexibility is estimated with fixed parameters. Then a fit with this noise and a new
+    estimate of the flexibility are repeated three times.
 
     Args:
         loop: the nominal chain.

@@ -77,7 +77,7 @@ class PoseEquations:
         return self.model.scales[self.model.parameter_indices(self.names)]
 
     def expand_to_all_parameters(self, values: np.ndarray) -> np.ndarray:
-        """Expand (..., q) free errors to errors of all parameters (..., p)."""
+        """Expand (..., q) errors of the free parameters to errors of all parameters (..., p), 0 for the others."""
         values = np.asarray(values, float)
         whole = np.zeros((*values.shape[:-1], len(self.model.names)))
         whole[..., self.model.parameter_indices(self.names)] = values
@@ -287,7 +287,10 @@ class Calibration:
 
     @cached_property
     def leave_one_out_errors(self) -> PoseErrors:
-        """Errors of poses, each predicted by a calibration to all other poses; of at most 200 poses."""
+        """Errors of poses, each predicted by a linearised calibration to all other poses.
+
+        They are computed for at most 200 poses, evenly spaced.
+        """
         return _leave_one_out_errors(self.equations, self.fit)
 
     @property
@@ -302,8 +305,8 @@ def calibrate_hybrid_robot(
 ) -> Calibration:  # fmt: skip
     """Identify the errors of a hybrid robot by least squares.
 
-    Unidentifiable parameters keep their nominal values. Poses whose residuals cannot be noise are
-    left out, at most 20 % of them, and are reported.
+    Unidentifiable parameters keep their nominal values. Poses whose residuals cannot be noise (F
+    test, probability below 1e-6) are left out one by one, at most 20 % of them, and are reported.
 
     Args:
         robot: nominal robot.
@@ -342,8 +345,9 @@ def calibrate_best_model(robot: HybridRobot, measurement: Measurement, names: Se
          ) -> Calibration:  # fmt: skip
     """Calibrate with both error models; return the calibration that predicts left-out poses better.
 
-    The models are `dh` (errors of D-H rows) and `poe` (errors of axis lines). `dh` is preferred
-    unless `poe` is better by more than 5 %. A robot specified by its axes has the `poe` model only.
+    The models are `dh` (errors of D-H rows) and `poe` (errors of axis lines). The criterion is the
+    RMS position error of poses predicted without them (leave-one-out). `dh` is preferred unless
+    `poe` is better by more than 5 %. A robot specified by its axes has the `poe` model only.
     If `names` are given for another robot, only `dh` is calibrated.
 
     Args:
@@ -414,11 +418,11 @@ def _check_poses(eq: PoseEquations) -> None:
 
 
 def _find_inconsistent_pose(eq: PoseEquations, fit: ParameterFit) -> int | None:
-    """Find the pose whose residual is least likely to be noise; return None if all can be noise.
+    """Return the index of the pose whose residual is least likely to be noise; None if all can be noise.
 
-    The influence of each pose on the fit is removed from its six residuals. Over the mean square of
-    the other poses, with `rest` degrees of freedom, their mean square has an F(6, rest)
-    distribution.
+    The influence of each pose on the fit is removed from its six residuals. The ratio of their mean
+    square to that of the other poses, with `rest` degrees of freedom, has an F(6, rest) distribution.
+    A pose is inconsistent if its probability times the number of poses is below 1e-6.
     """
     n = len(eq.measurement)
     residual = fit.residual.reshape(n, LEG_COUNT)

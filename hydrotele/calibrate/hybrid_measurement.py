@@ -85,7 +85,13 @@ class SensorNoise(StrictModel):
 
 
 class MeasurementSpec(StrictModel):
-    """Contents of `measurement.yaml`."""
+    """Contents of `measurement.yaml`.
+
+    Attributes:
+        robot: name of the measured robot; empty if not stated.
+        wires: anchors and platform points of the six measuring wires; None without wires.
+        noise: standard deviations of the sensors.
+    """
 
     robot: str = ""
     wires: WireGeometry | None = None
@@ -104,7 +110,8 @@ class Measurement:
         pose: measured pose of the moving platform in frame 0.
         covariance: (N, 6, 6) covariance of the leg readings minus those predicted from measured
             pose and carriage [m^2]; known up to a factor if `noise_is_known` is false.
-        noise_is_known: whether the noise is known.
+        noise_is_known: whether the noise of the legs and of the measured poses (or wires) is stated;
+            otherwise defaults are used.
     """
 
     source: str
@@ -129,7 +136,7 @@ class Measurement:
 
     @property
     def distinct_count(self) -> int:
-        """Number of different poses."""
+        """Number of different poses: those whose joint and leg readings differ when rounded to 1e-5 m or rad."""
         whole = np.hstack([self.joints, self.legs])
         return len(np.unique(np.round(whole / _POSE_RESOLUTION), axis=0))
 
@@ -146,7 +153,7 @@ def measurement_from_wires(
         legs: (N, 6) leg readings [m].
         lengths: (N, 6) wire lengths [m].
         wires: geometry of the wires.
-        noise: standard deviations by the names of `SensorNoise`, in SI.
+        noise: standard deviations by the names of `SensorNoise`, in SI; defaults if missing.
         source: name of the measurement, for messages.
 
     Raises:
@@ -350,9 +357,10 @@ def _check_covariance(file: Path, covariance: np.ndarray) -> None:
 
 
 def _check_robot(table: Table, robot: HybridRobot, joints, legs, pose: PlatformPose) -> None:
-    """Raise InputError if the leg readings differ from the nominal robot's at the measured poses.
+    """Raise InputError if the leg readings differ too much from the nominal robot's at the measured poses.
 
-    The limit is a median difference of 0.05 m; then the data are of another robot, unit or frame.
+    The limit is 0.05 m for the median absolute difference over all poses and legs. Larger
+    differences mean that the data are of another robot, unit or frame.
     """
     away = np.abs(leg_readings(robot, joints, pose) - legs)
     if np.median(away) > _MAX_LEG_DIFFERENCE:
@@ -398,7 +406,7 @@ def save_measurement(
 
 
 def format_measurement_yaml(robot: str, wires: WireGeometry | None, noise: Mapping[str, float]) -> str:
-    """Return the YAML text of `measurement.yaml`: robot, wires and noise, in mm and degrees.
+    """Return the YAML text of `measurement.yaml`: robot, wires and noise, converted to mm and degrees.
 
     Args:
         robot: name of the robot.

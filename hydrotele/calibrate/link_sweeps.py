@@ -16,13 +16,16 @@ from hydrotele.calibrate.calibration_loop import (
 
 
 class Sweep(NamedTuple):
-    """Reciprocating motion of one link while the others are held [deg, K's signs].
+    """Reciprocating motion of one link while the others are held.
+
+    Angles are in degrees, with the signs of Khoshzaban's D-H convention.
 
     Attributes:
-        moving: range of the moving link.
-        held: angle of each held link, by name.
-        drift: drift of each held link until the last pose, by name.
-        wander: amplitude of the grapple's rotation about the angle at which it points at the ball.
+        moving: lowest and highest angle of the moving link [deg].
+        held: angle of each held link at the first pose, by name [deg].
+        drift: change of each held link's angle from the first to the last pose, by name [deg].
+        wander: amplitude of the grapple's rotation about the angle at which it points at the ball
+            [deg].
         poses: number of poses.
         cycles: number of back-and-forth cycles of the moving link.
         phase: phase of the first pose within a cycle, 0 at the lower end [rad].
@@ -52,11 +55,11 @@ DRIFT_FREE_SWEEPS = {name: sweep._replace(drift={}, held=_HELD_ANGLES) for name,
 
 
 class SweepPoses(NamedTuple):
-    """Error-free poses of a stage.
+    """Error-free poses of the chain of manipulator and calibrator while one link moves.
 
     Attributes:
         link: moving link.
-        theta: (M, N) true angles with offsets [rad].
+        theta: (M, N) true angles of all N joints of the chain, with offsets [rad].
         reached_fraction: fraction of the requested poses that the calibrator reaches [1].
     """
 
@@ -66,7 +69,7 @@ class SweepPoses(NamedTuple):
 
 
 def generate_sweep_poses(loop: CalibrationLoop, link: str, sweep: Sweep, seed: int = 0) -> SweepPoses:
-    """Generate true poses while a link sweeps its range and held links drift.
+    """Generate error-free poses of the chain while a link sweeps its range and held links drift linearly.
 
     Args:
         loop: the true chain.
@@ -75,7 +78,7 @@ def generate_sweep_poses(loop: CalibrationLoop, link: str, sweep: Sweep, seed: i
         seed: seed of the random rotation of the grapple about the angle at which it points at the ball.
 
     Returns:
-        The poses that the calibrator reaches.
+        At most `sweep.poses` poses, evenly spaced among those that the calibrator reaches.
     """
     rng, count = np.random.default_rng([seed, len(link)]), 2 * sweep.poses
     u = np.linspace(0.0, 1.0, count)

@@ -71,9 +71,9 @@ class LinkageFit:
         rms: root mean square displacement error of the validation samples [m].
         vaf: variance of these samples accounted for by the linkage [%].
         rms_before: RMS error with the nominal parameters [m].
-        samples: number of samples, fitted and validation.
-        residual: (n,) displacement error of each sample [m].
-        angle: (n,) the angles [rad].
+        samples: number n of all samples, fitted and validation.
+        residual: (n,) fitted minus measured displacement of each sample [m].
+        angle: (n,) joint angle of each sample [rad].
     """
 
     axis: str
@@ -182,8 +182,9 @@ def linkage_parameters(found: LinkageFit) -> np.ndarray:
 def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
     """Return a machine whose cylinder pins and closed length are those of an identified linkage.
 
-    The base pin keeps its direction from the joint. The rod pin is rotated about the joint axis by
-    the change of the angle offset.
+    Both pins get the identified distances from the joint axis. The pin on the link inside the joint
+    keeps its direction from the joint. The pin on the link that the joint moves is rotated about the
+    joint axis by the change of the angle offset.
 
     Args:
         machine: the machine.

@@ -84,7 +84,8 @@ def _move_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
     """Return the machine with the arm's tip moved to a link that was attached at the tip.
 
     If a link had its origin at the tip before the calibration, the tip gets the link's new origin.
-    `before` and `origin` contain the origins of all links before and after the calibration [m].
+    Otherwise the machine is unchanged. `before` and `origin` contain the origins of all links before
+    and after the calibration [m].
     """
     if machine.arm is None:
         return machine
@@ -103,8 +104,9 @@ def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -
     Args:
         machine: the nominal machine.
         fit: the calibrated arm.
-        stages: the poses. If they contain readings of the manipulator's sensors, the offsets of
-            these sensors are the mean readings minus the identified held angles.
+        stages: the poses. If they contain readings of a held link's own sensor while the next link
+            towards the chassis moves, the offset of this sensor is the mean reading minus the
+            identified held angle.
 
     Returns:
         The machine with calibrated lengths, twists and ball joint, and with `sensor_errors` of

@@ -144,8 +144,8 @@ def hexapod_mechanism(name: str, kinds: tuple[JointKind, ...], straight: tuple[i
 
     Args:
         name: name of the mechanism.
-        kinds: joints of a leg, from the base to the platform.
-        straight: indices of a leg's links that join two parallel axes on one line.
+        kinds: kinds of a leg's joints, from the base to the platform.
+        straight: indices of a leg's links that connect two collinear joint axes.
 
     Returns:
         The mechanism.
@@ -279,7 +279,7 @@ def _end_jacobians(
 
     Returns:
         ((6 chains, 6 links), (6 chains, joint coordinates)): six rows per chain, a twist (rotation,
-        translation) in the fixed frame.
+        translation) in the fixed frame. An error of a link is a twist in the frame at its end.
     """
     joints = mechanism.joints
     sizes = [_SUBSPACES[joints[name].kind].shape[1] for name in joint_names]

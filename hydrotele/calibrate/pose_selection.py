@@ -24,7 +24,7 @@ class PoseSelection:
 
     Attributes:
         chosen: indices of the poses among the candidates.
-        index: value of the criterion; larger is better.
+        index: value of the criterion for the selected poses; larger is better.
         exchanges: number of exchanges made by the search.
     """
 

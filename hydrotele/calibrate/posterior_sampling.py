@@ -103,7 +103,8 @@ class Posterior:
 
     Attributes:
         names: the p parameters.
-        sample: (draws, walkers, p) every `thin`-th step after the burn-in.
+        sample: (draws, walkers, p) parameters at every `thin`-th step after the burn-in, where
+            `thin` is an argument of `sample_posterior`; a walker is one chain.
         log_probability: (draws, walkers) log probability of the sample.
         acceptance_fraction: mean fraction of accepted moves.
         autocorrelation: (p,) integrated autocorrelation times [steps of the chain].
@@ -278,7 +279,7 @@ def autocorrelation_time(chain: np.ndarray) -> np.ndarray:
         chain: (steps, walkers, p) the chains.
 
     Returns:
-        (p,) autocorrelation times [steps], at least 1.
+        (p,) autocorrelation times [steps of the given chains], at least 1.
     """
     import emcee
 

@@ -40,7 +40,7 @@ class ScaraSpec(StrictModel):
 
 @dataclass(frozen=True)
 class MeasuredPositions:
-    """Measured poses.
+    """Measured poses of a planar two-joint arm.
 
     Attributes:
         joints: (n, 2) theta of the first and phi of the second joint [rad].
@@ -53,14 +53,19 @@ class MeasuredPositions:
 
 @dataclass(frozen=True)
 class ScaraCalibration:
-    """Result of the calibration of an arm.
+    """Result of the calibration of a planar two-joint arm.
+
+    Distances are those of predicted from measured end positions.
 
     Attributes:
         fit: fit of the lengths and, if `has_offsets`, the joint offsets.
         has_offsets: whether joint offsets were fitted.
-        model_errors: RMS distance [m] of poses predicted by fits without them, by model.
-        nominal_rms: RMS distance of the nominal arm [m].
-        heldout_rms: RMS distance of the validation poses, or of each pose left out in turn [m].
+        model_errors: leave-one-out RMS distance [m] by model: each fitted pose is predicted by a fit
+            to the other ones.
+        nominal_rms: RMS distance with the nominal lengths, of the validation poses, or of all poses
+            without validation poses [m].
+        heldout_rms: RMS distance with the calibrated arm of the validation poses; without
+            validation poses, the leave-one-out RMS distance [m].
     """
 
     fit: ParameterFit
@@ -131,13 +136,13 @@ def load_scara(folder: Path) -> tuple[ScaraSpec, MeasuredPositions]:
 def calibrate_scara(nominal: ScaraSpec, measured: MeasuredPositions, heldout: Sequence[int] = ()) -> ScaraCalibration:
     """Calibrate a two-joint arm by least squares on its end positions, with or without joint offsets.
 
-    The model that predicts left-out poses better is returned.
+    Both models are fitted. The one with the smaller leave-one-out error is returned: each fitted
+    pose is predicted by a fit to the other ones.
 
     Args:
         nominal: nominal lengths.
         measured: measured poses.
-        heldout: indices of validation poses, which are not fitted; if empty, every pose is left out
-            in turn.
+        heldout: indices of validation poses, which are not fitted; may be empty.
 
     Returns:
         The calibration.
@@ -221,7 +226,7 @@ def select_scara_poses(nominal: ScaraSpec, measured: MeasuredPositions, count: i
 def simulate_scara(
     nominal: ScaraSpec, errors: Sequence[float], poses: int, noise: float, seed: int
 ) -> MeasuredPositions:
-    """Simulate measured poses of an arm with errors.
+    """Simulate measured poses, at random joint angles, of a planar two-joint arm with errors.
 
     Args:
         nominal: nominal lengths.

@@ -46,7 +46,7 @@ _MAX_ROUNDS, _SIZE_TOLERANCE = 200, 1e-4
 
 @dataclass(frozen=True)
 class ErrorSizes:
-    """Estimated standard deviations of the parameters' priors (their sizes) and of the noise.
+    """Estimated standard deviations of the parameters' normal priors and of the noise.
 
     Attributes:
         std: (p,) prior standard deviation of each parameter.
@@ -69,8 +69,10 @@ def estimate_prior_std_by_kind(
     """Estimate the prior standard deviation of each kind of parameters, and the noise, by maximum evidence.
 
     For `right_hand_side = matrix x + error` with x ~ N(0, s_kind^2), a fixed point is iterated:
-    `s^2 = sum x^2 / sum g`, `noise^2 = |error|^2 / (freedom - sum g)`. Here S is the covariance of
-    x, and `g = 1 - S_ii / s^2` is the fraction of a parameter that the measurements determine.
+    `s^2 = sum x^2 / sum g` over the parameters of a kind, and
+    `noise^2 = |error|^2 / (freedom - sum g)` with the sum over all parameters. Here x is the
+    posterior mean, S its covariance, and `g = 1 - S_ii / s^2` is the fraction of a parameter that
+    the measurements determine. Each s stays within 1e-7 to 100 times its start.
 
     Args:
         matrix: (m, p) equations with the unknown noise.
@@ -84,7 +86,7 @@ def estimate_prior_std_by_kind(
         min_noise: lower bound of the noise.
 
     Returns:
-        The standard deviations.
+        The standard deviations of parameters and noise.
 
     Source: MacKay 1992, Bayesian interpolation; Tipping 2001 (sizes that vanish).
     """
@@ -133,8 +135,8 @@ def cross_validation_error(
         folds: (m,) number of the fold, a group that is left out together, of each equation.
         sizes: standard deviations of parameters and noise, the same for all folds.
         known: equations (r, p) with an error of standard deviation 1, their right-hand side (r,) and
-            folds (r,). They are fitted with the other folds but not predicted. Without the distance
-            of the sockets, equal shrinking of all lengths would predict any ball position.
+            folds (r,), such as those of known distances of sockets. They are fitted with the other
+            folds but not predicted.
 
     Returns:
         The error, in the unit of the equations.
@@ -189,7 +191,7 @@ _KIND_BY_LETTER = {"t": "length", "r": "tilt"}
 
 @dataclass(frozen=True)
 class SocketOptions:
-    """Options of a socket calibration.
+    """Options of the calibration of a robot from postures with its ball in sockets.
 
     Attributes:
         distance: distance of neighbouring sockets of one tool [m]; None if unknown.
@@ -204,12 +206,12 @@ class SocketOptions:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row whose ball position disagrees with the other rows of its socket.
+    """A measured posture (row) whose predicted ball position disagrees with most rows of its socket.
 
     Attributes:
         socket: name of the socket.
         line: line number in its file.
-        distance: distance of the ball from the mean of the other rows [m].
+        distance: distance of the ball from the mean of the socket's consistent rows [m].
     """
 
     socket: str
@@ -219,13 +221,13 @@ class Outlier:
 
 @dataclass(frozen=True)
 class SocketErrors:
-    """Prediction errors of a robot at sockets.
+    """Prediction errors of a robot whose ball was in sockets; each row is one posture.
 
     Attributes:
         rms: root mean square distance of the predicted balls from their sockets' means [m].
         rms_without_outliers: the same without the rows in `outliers`.
         rms_by_socket: root mean square distance [m] by socket.
-        socket_distances: distance of the means of the first two sockets [m] by place.
+        socket_distances: distance of the first two sockets' mean balls [m] by place of the tool.
         outliers: rows that disagree with the other rows of their socket.
         distances_by_socket: distance of each row's ball from the socket's mean [m] by socket.
     """
@@ -240,7 +242,7 @@ class SocketErrors:
 
 @dataclass(frozen=True)
 class SocketCalibration:
-    """Result of a socket calibration.
+    """Result of the calibration of a robot from postures with its ball in sockets.
 
     Attributes:
         nominal: the given robot.
@@ -248,7 +250,7 @@ class SocketCalibration:
         model: joint model, a key of `JOINT_MODELS`.
         model_errors: cross-validated RMS error of a coordinate [m] by joint model.
         fit: fit of all parameters.
-        sizes: standard deviation [m], [rad] or [rad s^2/m^2] by kind of parameter.
+        sizes: estimated prior standard deviation [m], [rad] or [rad s^2/m^2] by kind of parameter.
         noise: standard deviation of one coordinate of the ball [m].
         nominal_errors: errors of the nominal robot with its ball fitted, at all sockets.
         calibrated_errors: errors of the calibrated robot at all sockets.
@@ -271,14 +273,14 @@ class SocketCalibration:
 
 @dataclass(frozen=True)
 class HeldOutPrediction:
-    """Prediction of one place, or socket, by calibrations on all others.
+    """Errors at the sockets of one place of the tool, or at one socket, that were not used to calibrate.
 
     Attributes:
         name: name of the place or socket.
         given_errors: errors of the nominal robot with the ball position of its file.
         nominal_errors: errors of the nominal robot with the ball fitted to all others.
         calibrated_errors: errors of the robot calibrated on all others.
-        model: joint model, selected without this place.
+        model: joint model, a key of `JOINT_MODELS`, selected without this place or socket.
     """
 
     name: str
@@ -289,7 +291,11 @@ class HeldOutPrediction:
 
 
 class _SocketProblem:
-    """Equations of sockets for a robot with joint corrections."""
+    """Equations of a robot whose ball is at one position in all n postures of each socket.
+
+    The p unknowns are the parameters of the robot's chain and the joint corrections `extra`
+    (deflection under gravity, encoder eccentricity). Socket positions are eliminated as means.
+    """
 
     def __init__(self, robot: SerialRobot, sockets: Sequence[Socket], extra: Sequence[str], options):
         self.robot, self.sockets, self.extra = robot, tuple(sockets), tuple(extra)
@@ -315,13 +321,13 @@ class _SocketProblem:
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
     def predict_balls(self, x: np.ndarray) -> np.ndarray:
-        """Compute the ball positions (n, 3) [m] of all rows for parameters x (p,)."""
+        """Compute the ball positions (n, 3) [m] in the base frame of all n postures for parameters x (p,)."""
         p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
         return chain_poses(self.chain, joints, x[:p]).position
 
     def subtract_means(self, balls: np.ndarray) -> np.ndarray:
-        """Return ball positions (n, 3) minus the mean position of their socket [m]."""
+        """Return ball positions `balls` (n, 3) minus the mean ball position of each one's socket [m]."""
         return balls - self.socket_means(balls)[self.index]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
@@ -352,7 +358,10 @@ class _SocketProblem:
         return np.vstack(rows)
 
     def equation_standard_deviations(self, noise: float) -> np.ndarray:
-        """Return the standard deviation of each equation of `residual` [m] for ball noise `noise` [m]."""
+        """Return the standard deviation of each equation of `residual` [m] for ball noise `noise` [m].
+
+        That of a socket distance includes the accuracy of the stated distance.
+        """
         means = [1.0 / self.count[a] + 1.0 / self.count[b] for a, b in self.pairs]
         gaps = np.sqrt(self.options.accuracy**2 + noise**2 * np.array(means))
         return np.concatenate([np.full(3 * len(self.joints), noise), gaps])
@@ -361,15 +370,17 @@ class _SocketProblem:
 def choose_robot(sockets: Sequence[Socket]) -> tuple[SerialRobot, dict[str, float]]:
     """Select the shipped robot that puts the ball most consistently at one position per socket.
 
+    The criterion is the scatter of the ball in its sockets, with its position in the last link fitted,
+    over its free travel, the scatter after each joint's readings are permuted at random.
+
     Args:
         sockets: the measurements.
 
     Returns:
-        The robot, and the median scatter [m] of the ball in its sockets by candidate, with the ball
-        position in the last link fitted.
+        The robot, and the median distance [m] of the ball from its socket's mean by candidate.
 
     Raises:
-        InputError: no shipped robot has this number of joints, or all have a large scatter.
+        InputError: no shipped robot has this number of joints, or the criterion of all exceeds 5 %.
     """
     count, folder = sockets[0].joints.shape[1], sockets[0].path.parent
     robots = {name: load_robot(name) for name in shipped_robots()}
@@ -395,7 +406,7 @@ def check_robot_fits_sockets(
 ) -> None:
     """Raise InputError if a robot's ball positions scatter too much within the sockets.
 
-    The scatter of the ball is compared with its travel if the joints moved independently. In a
+    The scatter is compared with the free travel, the scatter if the joints moved independently. In a
     socket, the motions of the joints cancel; with another unit, sign or order they do not.
 
     Args:
@@ -404,8 +415,8 @@ def check_robot_fits_sockets(
         options: options of the calibration; by default the distance of the sockets is unknown.
 
     Raises:
-        InputError: the ball positions of all files, or of one file, scatter too much, or the
-            distance of two sockets differs from the stated one.
+        InputError: the scatter exceeds 5 % of the free travel, that of one file also five times the
+            median, or the distance of two sockets differs by more than 3 (scatter + accuracy).
     """
     scatter = _ball_scatter(robot, sockets)
     if scatter.relative > _MAX_RELATIVE_SCATTER:
@@ -439,9 +450,13 @@ def calibrate_sockets(
 ) -> SocketCalibration:
     """Calibrate a robot from postures with its ball in sockets.
 
+    All geometric parameters are fitted so that the ball is at one position in all postures of a
+    socket. Standard deviations of their priors and of the noise are estimated. The joint model is
+    selected by cross-validation. Outlying postures are left out.
+
     Args:
         robot: nominal robot.
-        sockets: sockets at one or more places.
+        sockets: sockets at one or more places of the tool that holds them.
         options: options of the calibration.
 
     Returns:
@@ -524,7 +539,7 @@ def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketError
 
     Args:
         robot: nominal or calibrated robot, with its corrections.
-        sockets: sockets at any places.
+        sockets: the measured postures by socket.
 
     Returns:
         RMS distances from the means, distances of the sockets, and outliers.
@@ -540,12 +555,12 @@ def predict_held_out_places(
     names: Sequence[str],
     options: SocketOptions | None = None,
 ) -> tuple[HeldOutPrediction, ...]:
-    """Cross-validate: evaluate each named place, or socket, with a robot calibrated on all others.
+    """Cross-validate: evaluate the sockets of each name with a robot calibrated on all other sockets.
 
     Args:
         robot: nominal robot.
         sockets: all sockets.
-        names: names of places or sockets, each left out in turn.
+        names: names of places of the tool, or of sockets, each left out in turn.
         options: options of the calibrations.
 
     Returns:
@@ -560,7 +575,7 @@ def predict_held_out_places(
 def predict_held_out_place(
     robot: SerialRobot, sockets: Sequence[Socket], name: str, options: SocketOptions | None = None
 ) -> tuple[HeldOutPrediction, SocketCalibration]:
-    """Evaluate one place, or socket, with a robot that was calibrated on all other sockets.
+    """Evaluate one socket, or all sockets of one place of the tool, with a robot calibrated on all other sockets.
 
     Args:
         robot: nominal robot.
@@ -598,7 +613,7 @@ def predict_held_out_place(
 
 
 def list_names_to_hold_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Return the names to leave out in turn for validation.
+    """Return the names of places of the tool, or of sockets, to leave out in turn for validation.
 
     They are the places if there are several, otherwise the sockets; empty for a single socket.
     """
@@ -617,10 +632,10 @@ class _FitState:
 
 
 def _alternate_fit_and_prior(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
-    """Alternate between a fit of the parameters and an estimate of prior sizes and noise.
+    """Alternate between a fit of the parameters and an estimate of their prior deviations and the noise.
 
-    It stops when the noise changes by less than 0.1 %, or after six fits. Prior sizes are the
-    standard deviations of the parameters' priors.
+    The iteration stops when the noise changes by less than 0.1 %, or after six fits. It starts from
+    `begin`, or with None from the nominal robot with the ball position fitted.
     """
     kinds = _parameter_kinds(problem)
     if begin is None:
@@ -667,7 +682,7 @@ def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
 
 
 def _representative_rank(name: str) -> int:
-    """Return the rank of a parameter for representing a combination; a smaller rank is preferred.
+    """Return the rank of a parameter; of an identifiable combination the one with the smallest rank is named first.
 
     The order is ball position, joint offsets, lengths, tilts, then joint corrections.
     """
@@ -682,16 +697,16 @@ def _identifiability_scales(problem: _SocketProblem, state: _FitState) -> np.nda
     """Return the sizes (p,) with which the standard deviations of parameters are compared.
 
     A parameter is identifiable if its standard deviation is below half of its size. Sizes are the
-    estimated prior standard deviations with a lower bound.
+    estimated prior standard deviations, at least a tenth of their start values.
     """
     sag = np.array([name.startswith("sag") for name in problem.names])
     return np.maximum(state.sizes.std, np.where(sag, 0.1 * _START_SAG_SIZE, 0.1 * _START_SIZE))
 
 
 def _parameter_kinds(problem: _SocketProblem) -> list[str]:
-    """Return the kind of each parameter: offset, length, tilt, sag or eccentricity; empty for the ball.
+    """Return the kind of each parameter: offset, length, tilt, sag or eccentricity; "" for the ball position.
 
-    All parameters of a kind have the same prior standard deviation.
+    Sag is deflection under gravity. All parameters of a kind have the same prior standard deviation.
     """
     kinds = []
     for name in problem.names:
@@ -713,7 +728,10 @@ def _axis_letter(robot: SerialRobot, joint: str) -> str:
 
 
 def _fit_nominal_ball(problem: _SocketProblem) -> np.ndarray:
-    """Return nominal parameters with the ball position fitted so that it scatters least in the sockets."""
+    """Return the nominal parameters (p,) with the ball position in the last link fitted.
+
+    The fit minimises the sum of the ball's (unsquared) distances from its socket's mean.
+    """
     x = problem.start.copy()
     places = [problem.names.index(f"{c}.tool") for c in "xyz"]
     rates = chain_poses_and_derivatives(problem.chain, problem.joints, problem.chain.nominal_values)
@@ -736,11 +754,11 @@ class _BallScatter:
     """Scatter of the ball of the nominal robot in its sockets, with the ball position fitted.
 
     Attributes:
-        distance: median over sockets of the median distance from the mean [m].
-        relative: the same relative to the travel of the ball if the joints moved independently.
-        distance_by_socket: (k,) median distance from the mean [m].
-        relative_by_socket: (k,) the same relative to the travel.
-        means: (k, 3) mean positions [m].
+        distance: median over sockets of `distance_by_socket` [m].
+        relative: median over sockets of `relative_by_socket` [1].
+        distance_by_socket: (k,) median distance of the ball from its mean position in a socket [m].
+        relative_by_socket: (k,) that over the distance if the joints moved independently [1].
+        means: (k, 3) mean positions of the ball in the base frame [m].
     """
 
     distance: float
@@ -775,7 +793,7 @@ def _format_scatter(scatter: _BallScatter) -> str:
 
 
 def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str:
-    """Return advice to state degrees or radians if a robot then fits the data, otherwise an empty text."""
+    """Return advice to state degrees or radians if a robot's ball then scatters little, otherwise an empty text."""
     for unit, convert in (("deg", np.radians), ("rad", np.degrees)):
         other = [replace(s, joints=convert(s.joints)) for s in sockets]
         for name, robot in robots.items():
@@ -789,7 +807,10 @@ def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str
 
 
 def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None:
-    """Raise InputError if a fit contradicts the stated socket distance, or an error is implausibly large."""
+    """Raise InputError if a fit contradicts the stated socket distance, or an error is implausibly large.
+
+    Limits: 10 standard deviations (distance), a tenth of the reach (length), 0.3 rad (angle).
+    """
     folder = problem.sockets[0].path.parent
     many = 3 * len(problem.joints)
     gaps, sigma = fit.residual[many:], problem.equation_standard_deviations(noise)[many:]
@@ -819,8 +840,11 @@ def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None
 def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[str, float]]:
     """Select the joint model (rigid, gravity, eccentricity, both) with the smallest cross-validated error.
 
+    Folds are the places of the tool if there are more than two, otherwise the sockets. A model in
+    the options is kept. With a single fold, the model is otherwise `rigid`, and errors are empty.
+
     Returns:
-        (name of the model, cross-validated RMS error [m] by model). A model in the options is kept.
+        (name of the model, cross-validated RMS error [m] by model).
     """
     wanted = problem.options.model
     if wanted is not None and wanted not in JOINT_MODELS:
@@ -857,7 +881,10 @@ def _extend_state(problem: _SocketProblem, state: _FitState) -> _FitState:
 
 
 def _outlier_distance(noise: float, rows: int) -> float:
-    """Return the outlier limit [m]: noise alone exceeds it in any row in one of a thousand data sets."""
+    """Return the distance [m] from its socket's mean above which a ball position is an outlier.
+
+    Noise of standard deviation `noise` [m] exceeds it in one of a thousand data sets of `rows` rows.
+    """
     return noise * float(np.sqrt(scipy.stats.chi2.isf(_FALSE_ALARM_PROBABILITY / rows, 3)))
 
 
@@ -869,7 +896,10 @@ def _find_outliers(
 
 
 def _outlier_rows(problem: _SocketProblem, balls: np.ndarray, noise: float) -> list[Outlier]:
-    """Find rows whose ball is too far from the mean of its socket's other rows to be noise [m]."""
+    """Return the rows whose ball (n, 3) [m] is farther from its socket's mean than `_outlier_distance`.
+
+    The mean is that of the rows within this distance. `noise` is the deviation of a coordinate [m].
+    """
     found = []
     limit = _outlier_distance(noise, len(balls))
     for k, socket in enumerate(problem.sockets):
@@ -888,7 +918,9 @@ def _outlier_rows(problem: _SocketProblem, balls: np.ndarray, noise: float) -> l
 def _remove_gross_outliers(
     problem: _SocketProblem,
 ) -> tuple[tuple[Socket, ...], set[tuple[str, int]]]:
-    """Remove rows that are outliers already with the nominal robot.
+    """Remove rows that are outliers already with the nominal robot, with its ball position fitted.
+
+    The limit is that of twice the noise, estimated from the median distance from socket medians.
 
     Returns:
         (the remaining sockets, the removed rows as (socket name, line number)).
@@ -945,7 +977,7 @@ def _compute_socket_errors(problem: _SocketProblem, balls: np.ndarray) -> Socket
 
 
 def _neighbour_pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
-    """Return pairs of indices of sockets at the same place with successive numbers."""
+    """Return pairs of indices of successive sockets in the list that have the same place and successive numbers."""
     return [
         (k, k + 1) for k in range(len(sockets) - 1)
         if sockets[k].place == sockets[k + 1].place and sockets[k + 1].hole == sockets[k].hole + 1

@@ -33,11 +33,11 @@ _MAX_POSTURES = 2000  # postures per socket that are used: a log at 1 kHz contai
 
 @dataclass(frozen=True)
 class Socket:
-    """Postures with the ball in one socket.
+    """Postures of a robot with its ball in one socket of a tool that stands at one place.
 
     Attributes:
-        place: name of the tool's place.
-        hole: number of the socket.
+        place: name of the place of the tool that holds the sockets.
+        hole: number of the socket in the tool.
         path: path of the file.
         joints: (n, k) joint angles [rad], or positions [m].
         lines: (n,) line numbers of the rows in the file, from 1.
@@ -59,11 +59,12 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     """Read the postures (joint angles) of all sockets of a measurement folder.
 
     Args:
-        folder: folder with places or files.
-        degrees: whether the angles are in degrees; they are converted.
+        folder: folder with one folder per place of the tool, or with the files of one place. Files
+            are named `hole_0.csv`, `hole_1.csv`, ..., one per socket.
+        degrees: whether the angles in the files are in degrees; they are converted to radians.
 
     Returns:
-        The sockets by place and number, and notes on rows that were left out.
+        The sockets, ordered by path, and notes on rows that were left out.
 
     Raises:
         InputError: a file is invalid; the message names file, row and column.
@@ -93,7 +94,7 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
 
 
 def place_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Return the names of the places of the sockets, without repetition, in order."""
+    """Return the names of the places at which the socket tool stood, without repetition, in order."""
     return tuple(dict.fromkeys(socket.place for socket in sockets))
 
 
@@ -140,7 +141,11 @@ def _parse_number(word: str) -> float | None:
 
 
 def _remove_repeated(socket: Socket, notes: list[str]) -> Socket:
-    """Return a socket without repeated postures, at most 2000 evenly spaced ones; append notes on it."""
+    """Return a socket without repeated postures, thinned evenly to at most 2000; append notes on removed rows.
+
+    Raises:
+        InputError: there are fewer than three different postures.
+    """
     cells = np.round(socket.joints / _POSTURE_TOLERANCE)
     kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     if len(kept) < _MIN_POSTURES:
@@ -167,7 +172,7 @@ _IDLE_ANGLE = 0.3  # rad
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """Standard deviations of a robot's geometric errors and of its measurement.
+    """Standard deviations of a simulated robot's geometric errors and of its measurement.
 
     Attributes:
         length: displacements of joint frames [m].
@@ -190,7 +195,7 @@ def add_random_errors(
     robot: SerialRobot, errors: RobotErrors, rng: np.random.Generator,
     corrections: Mapping[str, float] | None = None,
 ) -> tuple[SerialRobot, dict[str, float]]:  # fmt: skip
-    """Return a robot with random geometric errors.
+    """Return a copy of a robot with random, normally distributed geometric errors.
 
     Args:
         robot: nominal robot.
@@ -217,12 +222,12 @@ def simulate_sockets(
     rng: np.random.Generator, distance: float = 0.050, limit: float = 2.8,
     idle: int | None = None,
 ) -> tuple[Socket, ...]:  # fmt: skip
-    """Simulate postures of a robot with its ball in two sockets at every place.
+    """Simulate postures of a robot with its ball in two sockets of a tool, at every place of the tool.
 
     Args:
         robot: true robot, with errors.
-        places: (3,) position of the first socket in the base frame [m] by place; the second socket
-            is displaced in y.
+        places: (3,) position of the first socket in the base frame [m] by name of the place; the
+            second socket is displaced in y.
         rows: postures per socket.
         errors: noise of the encoders and play of the ball.
         rng: random generator.
@@ -250,7 +255,7 @@ def simulate_sockets(
 
 
 def save_sockets(sockets: Sequence[Socket], folder: Path) -> None:
-    """Write sockets as `PLACE/hole_N.csv`, rows of joint angles [rad]."""
+    """Write each socket's postures to `PLACE/hole_N.csv` in a folder: rows of joint angles [rad] or positions [m]."""
     for socket in sockets:
         path = folder / socket.place / f"hole_{socket.hole}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -264,7 +269,8 @@ def _solve_postures(
     """Find random postures that put the ball into a socket at `middle` (3,) [m].
 
     Returns:
-        (rows, k) encoder readings [rad] or [m], without noise.
+        (rows, k) encoder readings [rad] or [m], without noise. Each posture puts the ball at `middle`
+        plus random play.
 
     Raises:
         InputError: too few postures are found.

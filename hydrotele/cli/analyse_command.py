@@ -177,10 +177,10 @@ def analyse_case(
 
 
 def _packet_ages(case: TeleoperatorAxis, robustness_options: RobustnessOptions) -> PacketAges:
-    """Return how often the newest received packet is 0, 1, 2, ... sampling periods old when it is used.
+    """Return the fractions of sampling periods in which the newest received packet is 0, 1, 2, ... periods old.
 
-    The result has one distribution per direction. The packet delays are those of the CSV file in the
-    options, else the constant delays of the case.
+    The result has one distribution per direction. The packet delays are those of the CSV file in
+    the options, else the constant delays of the case.
 
     Raises:
         InputError: period, number of operators or file are not usable.

@@ -33,16 +33,16 @@ _SHORT_RUN_ARGUMENTS = ("run", "excitation", "--set", "duration=1.0", "--no-revi
 
 
 def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
-    """Run the benchmarks, print the results, and save them or compare them with earlier ones.
+    """Run the benchmarks, print the results, and save them or compare them with earlier ones on request.
 
     Args:
         save: file to write the results to, or None.
-        compare: file with earlier results, or None.
+        compare: file with earlier results, or None; they are printed next to the new ones.
         quick: use fewer repetitions.
-        as_json: print JSON only.
+        as_json: print the new results as JSON only.
 
     Raises:
-        InputError: the file to compare with cannot be read.
+        InputError: the file to compare with cannot be read, or the file to save cannot be written.
     """
     earlier = _read(compare) if compare else None
     if save and not save.parent.is_dir():
@@ -61,14 +61,15 @@ def measure_speed(repeats: int) -> dict:
     """Measure simulation speed and start-up time; each time is the shortest of several repetitions.
 
     Args:
-        repeats: number of repetitions; the two times per step use six times as many.
+        repeats: number of repetitions of the batches. The two times per step use six times as many,
+            scenarios half as many, and start-up times always three or two.
 
     Returns:
         mechanism_us, hydraulics_us: computing time of one step without and with hydraulics [us];
-        hydraulics_to_mechanism_ratio: their ratio. The realtime factors are simulated time over
-        computing time, for teleoperation by scenario. batch_steps_per_s: by thread count;
-        batch_scaling: speed of two threads over that of one. help_s, run_s: duration of `--help`
-        and of a run of 1 s in a new process [s].
+        hydraulics_to_mechanism_ratio: hydraulics_us over mechanism_us. The realtime factors are
+        simulated time over computing time, for teleoperation by scenario. batch_steps_per_s: steps
+        of all simulations per second, by thread count; batch_scaling: speed of two threads over
+        that of one. help_s, run_s: duration of `--help` and of a run of 1 s in a new process [s].
     """
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")
@@ -119,7 +120,10 @@ def _make_hydraulic_job(plant: Plant) -> Callable[[], float]:
 
 
 def _make_mechanism_job(plant: Plant) -> Callable[[], float]:
-    """Return a function that steps the mechanism without hydraulics and gravity, and returns its duration [s]."""
+    """Return a function that makes 1000 steps of the mechanism and returns their duration [s].
+
+    The mechanism has neither hydraulics nor gravity.
+    """
     root = assemble_mjcf(plant.machine, plant.model.opt.timestep, plant.ground, visuals=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
@@ -161,7 +165,7 @@ def _make_batch_job(plant: Plant, threads: int) -> Callable[[], float]:
 
 
 def _measure_scenario_realtime_factor() -> float:
-    """Return the real-time factor (simulated per computing time) of the shipped scenario `excitation`.
+    """Run the shipped scenario `excitation` and return its real-time factor (simulated over computing time).
 
     The run includes control, sensors and logging.
     """
@@ -172,7 +176,7 @@ def _measure_scenario_realtime_factor() -> float:
 
 
 def _measure_teleop_realtime_factor(name: str) -> float:
-    """Return the real-time factor (simulated per computing time) of a teleoperated scenario.
+    """Run a teleoperated scenario and return its real-time factor (simulated over computing time).
 
     The run includes the models of the operator and of the communication channel.
     """

@@ -46,12 +46,13 @@ class ArmChoices(NamedTuple):
 
     Attributes:
         method: `joint` fits all links together, `hierarchical` one link after the other.
-        poses: number of poses used of each log.
+        poses: maximum number of poses used of each log.
         accuracy_deg: standard deviation of an angle sensor [deg], None for that of the log.
         bad_data: whether corrupted samples are detected and excluded.
-        drift: whether slow motion of links that should be at rest is read from the arm's sensors
-            and corrected.
-        heldout: N as text: every N-th pose is held out; None for 5.
+        drift: whether slow motion of links that should be at rest is measured by the arm's own
+            sensors and included in the fit.
+        heldout: N as text: every N-th pose is held out (not fitted, but predicted for validation);
+            None for 5.
         flexibility: whether the flexibility of the calibrator's joints is estimated.
     """
 
@@ -70,9 +71,11 @@ class ArmResult(NamedTuple):
     Attributes:
         machine: machine with the parameters before the calibration.
         fit: fitted parameters of the arm.
-        stages: poses used for the fit, one item per log.
-        regions: intervals of corrupted samples that were excluded.
-        heldout_errors: errors on held-out poses, empty without such poses.
+        stages: fitted poses, one item per log, without held-out and excluded poses.
+        regions: intervals of poses with a corrupted angle sensor. The poses were excluded if this
+            sensor belongs to the calibrator, and kept if it is the arm's own.
+        heldout_errors: errors on held-out poses, as from `_heldout_errors`; empty without such
+            poses.
         calibrated: machine with the fitted parameters.
         flexibility: flexibility of the calibrator's joints, None if it was not estimated.
     """
@@ -187,10 +190,15 @@ def fit_arm(
 def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Poses]) -> dict[str, Any]:
     """Return how well the kinematic loop of arm and calibrator closes on held-out poses.
 
+    The loop has two errors per pose [m]: of the distance of the calibrator's ball joint from the
+    axis of the moving joint, and of its height along this axis.
+
     Returns:
-        `poses`: their number. `rms_nominal_mm`: RMS gap of the loop with the parameters before the
-        fit, without its mean. `rms_identified_mm`: RMS gap with the fitted parameters. `chi`: RMS of
-        these gaps over their standard deviation due to sensor noise. Empty without held-out poses.
+        `poses`: number of held-out poses. `rms_nominal_mm`: RMS of both errors with the parameters
+        before the fit, minus the mean of each error over the poses of a log. `rms_identified_mm`:
+        RMS of both errors with the fitted parameters. `chi`: RMS of the errors with the fitted
+        parameters, divided by their standard deviation due to sensor noise. The dict is empty
+        without held-out poses.
     """
     if not heldout_poses:
         return {}
@@ -211,7 +219,11 @@ def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Pose
 
 
 def arm_result_to_dict(result: ArmResult) -> dict[str, Any]:
-    """Return an arm calibration in the form of `calibration.json`, in SI units."""
+    """Return an arm calibration in the form of `calibration.json`.
+
+    Parameters are in SI units. RMS errors are in mm and errors of corrupted sensors in deg, as the
+    suffixes `_mm` and `_deg` of their keys state.
+    """
     fit = result.fit
     rows = [
         {
@@ -310,13 +322,20 @@ def _print_arm_document(document: Mapping[str, Any]) -> None:
 
 
 def print_output_folder(target: Path | None) -> None:
-    """Print where the calibration was written, if it was."""
+    """Print the output folder of a calibration and the file of the calibrated machine; nothing for None."""
     if target:
         stdout_console.print(f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}")
 
 
 def write_calibration_folder(target: Path, document: Mapping[str, Any], machine: Machine, write_report) -> None:
-    """Write the document, the calibrated machine and the report to a folder, completely or not at all."""
+    """Write the results of an arm or linkage calibration to a folder, completely or not at all.
+
+    Args:
+        target: output folder.
+        document: content of `calibration.json`.
+        machine: calibrated machine, written as `machine.yaml`.
+        write_report: function of the folder that writes the report into it.
+    """
     with atomic_folder(target, "arm calibration") as folder:
         write_json(folder / "calibration.json", document)
         save_machine(machine, folder / MACHINE_FILE)
@@ -334,16 +353,20 @@ def write_arm_report(folder: Path, result: ArmResult) -> None:
 
 
 def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as_json: bool) -> None:
-    """Search for the link lengths and ball-joint position of a calibrator that give the best calibration.
+    """Search for the calibrator whose arm calibration gives the smallest error of the arm's tip; print it.
 
-    The present and the best design are printed. With a target, all evaluated designs are drawn and
-    written as JSON.
+    The design variables are both link lengths and the position of the ball joint on the chassis.
+    The present and the best design are printed. With a target, a grid of link lengths is drawn with
+    both designs, and all are written as JSON.
 
     Args:
         machine: machine with a calibrator, as a shipped name or a folder.
         accuracy_deg: error bound of an angle sensor [deg].
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
+
+    Raises:
+        InputError: machine or target are not usable.
     """
     from hydrotele.calibrate.calibrator_design import evaluate_design_grid, optimize_design
 

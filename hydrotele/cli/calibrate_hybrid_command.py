@@ -83,16 +83,18 @@ def calibrate_hybrid(
     Args:
         data: folder with `poses.csv` or `poses.parquet`.
         robot: nominal robot, None for that of the folder, else `iwr`.
-        error_model: error model: `dh` (Denavit-Hartenberg), `poe` (product of exponentials) or `auto`.
-        parameters: `all`, `document` (the 36 of Wang 2012) or names separated by commas.
+        error_model: error model: `dh` (Denavit-Hartenberg), `poe` (product of exponentials) or
+            `auto` (the better one).
+        parameters: parameters to fit: `all`, `document` (the 36 of Wang 2012) or names separated by
+            commas.
         evolution: whether to search by differential evolution as well.
-        mcmc_steps: number of MCMC steps, 0 for no MCMC.
+        mcmc_steps: number of MCMC steps to sample the posterior, 0 for no MCMC.
         seed: random seed of differential evolution and MCMC.
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
 
     Returns:
-        The calibration.
+        The calibration by least squares, without the results of differential evolution and MCMC.
 
     Raises:
         InputError: the folder, the robot or an option is not usable.
@@ -397,9 +399,14 @@ def simulate_hybrid_to_folder(
 
 
 def _sample_informative_poses(model, wires, count: int, rng: np.random.Generator, criterion: Any):
-    """Return joint values and leg lengths of the `count` most informative of many random poses.
+    """Sample random poses and return joint values and leg lengths of the `count` most informative ones.
 
-    `criterion` is the observability criterion to maximise: D or O1 to O5.
+    Args:
+        model: error model of the nominal robot.
+        wires: wire sensors that measure the poses.
+        count: number of poses to select, out of 200 samples or more.
+        rng: random generator of the samples.
+        criterion: observability criterion to maximise: D or O1 to O5.
     """
     from hydrotele.simulate.pose_measurements import sample_poses
 

@@ -80,10 +80,13 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
 def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport = ignore_stage) -> list[LinkageFit]:
     """Fit the triangle of joint and two pins of each cylinder to joint angles and lengths; write no files.
 
+    If several logs move a cylinder, the one with the largest range of joint angles is fitted.
+
     Args:
         nominal: nominal machine.
         data: folder of logs.
-        angles: source of the joint angles: `measured` by sensors or `identified` by the calibrator.
+        angles: source of the joint angles: `measured` by sensors, or `identified` from the readings
+            of the external calibrator.
         report: called with the name of each stage and the completed fraction.
 
     Returns:
@@ -126,7 +129,10 @@ def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport 
 
 
 def linkage_fit_to_dict(fit: LinkageFit) -> dict[str, Any]:
-    """Return a linkage calibration in the form that `--json` prints, in SI units."""
+    """Return a linkage calibration in the form that `--json` prints.
+
+    Values are in SI units, except the variance accounted for [%] on held-out samples.
+    """
     deviations = dict(zip(fit.fit.names, fit.fit.standard_deviations, strict=True))
     return {
         "parameters": [

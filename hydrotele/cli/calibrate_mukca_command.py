@@ -51,10 +51,12 @@ _MAX_PRINTED_ROWS, _MAX_TEXT_LENGTH = (
 class SocketChoices:
     """Options of `hydrotele calibrate mukca`.
 
+    The tool that holds the sockets stands at several places, one after the other.
+
     Attributes:
         robot: shipped robot or file, None to find one.
-        heldout: held-out place or socket, None for each place in turn.
-        distance: distance of neighbouring sockets [m], 0 if not known.
+        heldout: place or single socket that is held out, None for each place in turn.
+        distance: distance of neighbouring sockets of the tool [m], 0 if not known.
         accuracy: standard deviation of that distance [m].
         unit: unit of the joint angles, `rad` or `deg`.
         model: joint model, None to select the most accurate one.
@@ -74,7 +76,8 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     The result is printed and written, with predictions of held-out places.
 
     Args:
-        data: folder with a subfolder for each place of the sockets; it has one CSV file per socket.
+        data: folder with one subfolder for each place of the tool that holds the sockets, and in it
+            one CSV file of joint angles per socket.
         choices: options of the calibration.
         target: output folder, written completely or not at all; None to write nothing.
         as_json: print JSON instead of text.
@@ -134,8 +137,8 @@ def socket_document(
     Args:
         data: folder of the measurements.
         sockets: measured joint angles of each socket.
-        calibration: calibration from the fitted sockets.
-        heldout_parts: predictions of held-out places or sockets.
+        calibration: result of the calibration with the fitted sockets.
+        heldout_parts: predictions of held-out places or sockets, each by a calibration without it.
         notes: sentences for the user.
     """
     fit, angular = calibration.fit, ("r", "s", "c")

@@ -43,11 +43,11 @@ def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) 
     Args:
         folder: folder to write.
         poses: number of poses.
-        noise: standard deviation of the positions [m].
+        noise: standard deviation of the measured positions [m].
         seed: random seed of poses and noise.
 
     Raises:
-        InputError: the folder is not empty.
+        InputError: the folder is not empty, or a number is out of range.
     """
     check_range("--seed", seed, 0, MAX_SEED, "random seed")
     check_range("--noise", 1e3 * noise, 0.0, MAX_SCARA_NOISE, "standard deviation [mm]")
@@ -64,8 +64,9 @@ def calibrate_scara_to_folder(
 
     Args:
         data: folder with `nominal.yaml` and `measured.csv`.
-        heldout: numbers of the held-out poses, from 1, separated by commas; None for each in turn.
-        choose: number of most informative poses to list, None for none.
+        heldout: numbers of the held-out poses, from 1, separated by commas; None to hold out each
+            pose in turn.
+        choose: number of most informative poses to select and list, None for none.
         target: output folder, written completely or not at all; None to write nothing.
         as_json: print JSON instead of text.
 

@@ -61,7 +61,8 @@ class ModelComparison:
         kind: `machine`, or `baseline` for a black-box model.
         runs: prediction errors, one item per run.
         plotted_prediction: (n, c) open-loop predictions of n rows and c channels of the first run.
-        lost: one sentence per run in which the model cannot even follow the readings from row to row.
+        lost: one sentence per run on which the one-step predictions of the model diverge, although
+            the measurements correct them at every row.
     """
 
     name: str
@@ -77,7 +78,7 @@ class ModelComparison:
             horizon: name of a prediction horizon, or `one row` for one-step predictions.
 
         Returns:
-            (c,) errors in SI units, NaN without measurements.
+            (c,) errors in SI units; NaN without measurements, infinite if a prediction diverged.
         """
         if horizon == _ONE_STEP:
             found = [errors.one_step for errors in self.runs]
@@ -87,7 +88,7 @@ class ModelComparison:
         return np.array([column.mean() if len(column) else math.nan for column in columns])
 
     def count_diverged_predictions(self, horizon: str) -> tuple[int, int]:
-        """Return how many predictions over a horizon diverged, and the number of all predictions."""
+        """Return how many predictions over a horizon diverged, and how many there are, over all runs."""
         found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
         return sum(h.diverged for h in found), sum(h.windows for h in found)
 
@@ -166,7 +167,14 @@ def build_comparison_document(
     dataset: Dataset,
     data: Sequence[Path],
 ) -> dict[str, Any]:
-    """Return the comparison as JSON data: RMS errors in SI units, None if a model diverged."""
+    """Return the comparison as JSON data: RMS errors in SI units, None if a model diverged.
+
+    Args:
+        comparisons: prediction errors of each model.
+        printed_horizons: names of the horizons at which errors are averaged over the runs.
+        dataset: logs, channels and the first machine.
+        data: paths of the logs.
+    """
 
     def map_channels_to_values(values: np.ndarray) -> dict[str, float]:
         return dict(zip(dataset.channels, values.tolist(), strict=True))
@@ -242,7 +250,13 @@ def _evaluate_models(
 
 
 def _check_same_channels(name: str, machine: Machine, dataset: Dataset) -> None:
-    """Raise InputError if a machine has other axes or channels than the first machine."""
+    """Raise InputError if a machine has other axes than the first machine, or no prediction of a channel.
+
+    Args:
+        name: name of the machine, for the message.
+        machine: the machine.
+        dataset: logs with axes and compared channels, which are those of the first machine.
+    """
     if tuple(actuator_order(machine)) != dataset.axes:
         raise InputError(
             f"machine {name}",
@@ -262,7 +276,7 @@ def _check_horizons(horizons: Sequence[float], evaluated_runs: Sequence[RunData]
 
 
 def _available_horizons(comparisons: Sequence[ModelComparison]) -> list[str]:
-    """Return the prediction horizons that fit into at least one evaluated run, in ascending order."""
+    """Return the names of the prediction horizons that fit into at least one evaluated run, shortest first."""
     found = {name: h.seconds for m in comparisons for e in m.runs for name, h in e.horizons.items()}
     return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
 
@@ -270,7 +284,8 @@ def _available_horizons(comparisons: Sequence[ModelComparison]) -> list[str]:
 def _choose_plot_horizon(horizons: Sequence[float], run: RunData) -> float:
     """Return the time after which the plotted prediction restarts from the measurements [s].
 
-    It is the longest horizon that fits three times into the plot, else a third of the plot.
+    It is the longest horizon that fits three times into the plot, else a third of the plot. The
+    plot shows the run, but at most 120 s of it.
     """
     seconds = min(_MAX_PLOT_SECONDS, len(run.reading) * run.period)
     return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)

@@ -149,7 +149,10 @@ def compile_all(processes: int | None = None) -> None:
 
 
 def _hash_sources_and_versions() -> str:
-    """Return a hash of all that determines the compiled code: Python, numba, processor and sources."""
+    """Return a hash of versions of Python and numba, name of the processor and all sources of the package.
+
+    Equal hashes mean equal compiled code.
+    """
     package = Path(hydrotele.__file__).parent
     text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
     for path in sorted(package.rglob("*.py")):

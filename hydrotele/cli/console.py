@@ -29,7 +29,7 @@ _UNKNOWN_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])
 
 
 class _Console(Console):
-    """Console that interprets only a few styles in brackets; other brackets are printed."""
+    """Console that interprets only known style tags, such as [bold]; other brackets are printed as text."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Return a text in which known style tags are applied; unknown or unmatched tags remain as text."""
@@ -214,6 +214,8 @@ def announce_output(what: str, path: Path | None, quiet: bool = False) -> Iterat
 @contextlib.contextmanager
 def catch_first_interrupt() -> Iterator[Callable[[], bool]]:
     """Handle the first Ctrl-C as a request to stop; the second one raises KeyboardInterrupt.
+
+    Outside the main thread, Ctrl-C is not handled.
 
     Yields:
         A function that returns whether Ctrl-C was pressed.

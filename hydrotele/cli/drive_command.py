@@ -61,8 +61,9 @@ class DriveOptions(NamedTuple):
         device: input device, such as `keyboard` or `haptic:HOST:PORT`.
         target: output folder, None for `runs/<scenario>`.
         viewer: whether to open a window.
-        duration: duration [s], None for the default.
-        speed: simulated time per real time [1].
+        duration: maximum simulated time [s], None for the default of 600 s (60 s with `latency` and
+            a simulated device).
+        speed: simulated time per real time [1], 0 for as fast as possible.
         review: whether to write the rerun recording.
         json: print JSON instead of text.
         latency: whether to measure and print latencies of a haptic device.
@@ -168,7 +169,8 @@ def _measure_stolen_time(before: float | None, seconds: float) -> dict[str, floa
 def _drive_with_latency_test(options: DriveOptions) -> Path:
     """Drive with a haptic device and print latencies, after an idle loop that tests the computer.
 
-    If no device is given, a simulated one is started in a separate process.
+    If no device is given (`keyboard` is the default), a simulated haptic device is started in a
+    separate process.
 
     Raises:
         InputError: the given device has no force output.
@@ -187,10 +189,13 @@ def _drive_with_latency_test(options: DriveOptions) -> Path:
 
 
 def _run_idle_test(duration: float) -> dict[str, Any]:
-    """Count the deadlines that an idle loop misses on this computer, without a simulation.
+    """Count the deadlines that a loop without work misses on this computer, as a baseline for a drive.
 
     Args:
         duration: duration of the drive [s]; the loop runs for a third of it, but 1 to 20 s.
+
+    Returns:
+        Result of `measure_missed_deadlines` at the control rate of a drive with a haptic device.
     """
     seconds = min(_IDLE_TEST_LIMITS[1], max(_IDLE_TEST_LIMITS[0], duration / 3.0))
     stderr_console.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
@@ -220,7 +225,9 @@ def _write(result: Run, target: Path, options: DriveOptions) -> None:
 def _load_drive_scenario(options: DriveOptions) -> Scenario:
     """Load the given scenario, or the default scenario of the machine, with all overrides applied.
 
-    Duration and, for a haptic device, the control rate are set from the options.
+    Duration and, for a haptic device, the control rate are set from the options. In a default
+    scenario of a machine with undetermined joints (`_find_undetermined_joints`), the true tip force
+    is reflected instead of an estimate from the pressures, and the sensors are ideal.
     """
     overrides, name = dict(options.overrides), options.scenario
     duration = DEFAULT_DURATION if options.duration is None else options.duration

@@ -27,7 +27,7 @@ _COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
 
 
 def load_experiment_series(name: str) -> Series:
-    """Import the experiments and claims of a publication by its name, such as `zhu1994`.
+    """Import and return the experiments and claims of a publication by its name, such as `zhu1994`.
 
     Raises:
         InputError: there is no publication of this name.

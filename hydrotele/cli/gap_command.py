@@ -99,12 +99,13 @@ def gap_to_folder(
 
 @contextlib.contextmanager
 def keep_interim_answer(target: Path) -> Iterator[Callable[[Interim], None]]:
-    """Keep the best answer so far in the folder `TARGET.interim`, until the final folder is complete.
+    """Let a search store its best answer so far in the folder `TARGET.interim`; delete it after success.
 
-    If the context ends with an error or with Ctrl-C, the folder stays and its path is printed (stderr).
+    If the context ends with an error or with Ctrl-C, the folder stays and its path is printed on
+    stderr.
 
     Args:
-        target: the final folder.
+        target: final output folder of the search.
 
     Yields:
         A function that writes an answer: `interim.json` and the corrected machine, `machine.yaml`.
@@ -138,9 +139,10 @@ def keep_interim_answer(target: Path) -> Iterator[Callable[[Interim], None]]:
 def write_gap_files(
     gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
 ) -> None:
-    """Write the result of a search for model errors: JSON, report, corrected machine and recording.
+    """Write the result of a search for model errors: `gap.json`, report, summary and recording.
 
-    If the search proposes a next experiment, its scenario is written as well.
+    The corrected machine is written to `patched/` if it differs from the given one. If the search
+    proposes a next experiment, its scenario is written as well.
 
     Args:
         gap: result of the search.
@@ -246,12 +248,14 @@ def find_mechanism_files(
     """Return MJCF and column file if the options select a mechanism without hydraulics.
 
     Args:
-        machine: name of a machine, or of a shipped model without `machine.yaml`.
+        machine: name of a machine, or of a shipped model without `machine.yaml`, which is a
+            mechanism.
         mjcf: MJCF file of a mechanism.
-        columns: YAML file that assigns log columns.
+        columns: YAML file that assigns log columns; None for `columns.yaml` of the shipped model,
+            if it has one.
 
     Returns:
-        (MJCF file, column file); (None, None) if the options select a machine.
+        (MJCF file, column file or None); (None, None) if the options select a machine.
 
     Raises:
         InputError: `columns` without a mechanism, or both a mechanism and a machine.
@@ -277,9 +281,10 @@ _OPEN_LOOP_HORIZON = 0.25  # s; short, because an unstable mechanism diverges wi
 def compute_open_loop_errors(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
-    """Compute position errors of open-loop simulations of the given and the corrected model.
+    """Compute position errors of open-loop simulations of the given and the corrected mechanism model.
 
-    The simulations are driven by the measured forces of the held-out run and last 0.25 s each.
+    MuJoCo simulates each model for 0.25 s with the measured forces of the held-out run, from
+    measured states at several instants of this run. The positions at the end are compared.
 
     Args:
         gap: result of the search for model errors of a mechanism.
@@ -288,8 +293,8 @@ def compute_open_loop_errors(
         heldout: name of the held-out run, None for `test*`, else the last run.
 
     Returns:
-        `horizon` [s], and `before` and `after`: {drive: RMS position error [rad] or [m]}; `after` only
-        if the model was corrected.
+        `horizon` [s], and `before` and `after`: {drive: RMS position error [rad] or [m]} of the
+        given and the corrected model; `after` only if the model was corrected.
 
     Raises:
         InputError: forces are missing in the held-out run, or a simulation fails.

@@ -51,9 +51,10 @@ class HapticOptions(NamedTuple):
 
 
 def serve_device(options: HapticOptions) -> None:
-    """Serve a haptic device by UDP until Ctrl-C, the end of the duration or of standard input.
+    """Serve a haptic device by UDP until Ctrl-C or the end of the duration.
 
-    Counts of missed deadlines and rejected packets are printed at the end.
+    With `until_eof`, the end of standard input stops the server, too. Counts of missed deadlines
+    and rejected packets are printed at the end.
 
     Raises:
         InputError: there is no such device, or the address cannot be used.
@@ -180,9 +181,14 @@ def print_latency(figures: dict) -> None:
 def describe_computer_timing(machine: dict, computer: dict) -> list[str]:
     """Describe the processor time taken by the host, and whether computer or program missed deadlines.
 
+    More than 0.1 % missed deadlines of the idle loop are attributed to the computer. Otherwise,
+    more than 0.1 % missed deadlines of the machine are attributed to the simulation or to other
+    programs.
+
     Args:
         machine: item `haptic.machine` of the summary of a drive.
-        computer: item `haptic.computer` of the same summary.
+        computer: item `haptic.computer` of the same summary, with the results of the idle loop, if
+            any.
 
     Returns:
         Sentences to print.

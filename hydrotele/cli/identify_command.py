@@ -213,7 +213,8 @@ def identify_mechanism(dataset: Dataset, choices: IdentificationOptions) -> Mech
         choices: options of the identification.
 
     Returns:
-        The identified parameters and the machine that has them.
+        The identified parameters and the machine that has them. If the logs do not contain forces
+        and `choices.hydraulics` is True, the unchanged machine with the reason.
 
     Raises:
         InputError: the logs do not contain forces, and `choices.hydraulics` is False.

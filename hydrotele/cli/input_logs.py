@@ -23,8 +23,8 @@ class OpenedLogs(NamedTuple):
 
     Attributes:
         machine: the machine.
-        runs: files of each run, with all channels, also the true states of a simulation.
-        merged: the runs on uniform clocks.
+        runs: logs of each run as recorded, with all channels, also the true states of a simulation.
+        merged: the runs after resampling to a uniform sample period.
     """
 
     machine: Machine
@@ -33,7 +33,7 @@ class OpenedLogs(NamedTuple):
 
     @property
     def logs(self) -> tuple[Log, ...]:
-        """All log files."""
+        """All logs as recorded, of all runs."""
         return tuple(log for run in self.runs for log in run.logs)
 
     @property
@@ -45,11 +45,12 @@ class OpenedLogs(NamedTuple):
 def open_logs(
     paths: Sequence[Path], machine: str | None = None, tool: str | None = None, force: bool = False
 ) -> OpenedLogs:
-    """Load logs and their machine, check the logs against it, and put them on uniform clocks.
+    """Load logs and their machine, check the logs against it, and resample them to uniform sample periods.
 
     Args:
         paths: log files, folders of logs, run folders.
-        machine: name or folder of a machine, None to find it.
+        machine: name or folder of a machine, None for that next to the log, else that of its
+            metadata.
         tool: tool of the machine, None for the tool of the log if the machine has it.
         force: accept logs whose metadata names another machine or tool.
 
@@ -62,11 +63,12 @@ def open_logs(
 
 
 def open_single_log(path: Path, machine: str | None = None, tool: str | None = None, force: bool = False) -> OpenedLogs:
-    """Load the log of a path that contains exactly one, and its machine, and check them.
+    """Load the log of a path that contains exactly one, and its machine, and check the log against it.
 
     Args:
         path: log file, folder with one log, or run folder.
-        machine: name or folder of a machine, None to find it.
+        machine: name or folder of a machine, None for that next to the log, else that of its
+            metadata.
         tool: tool of the machine, None for the tool of the log if the machine has it.
         force: accept a log whose metadata names another machine or tool.
 
@@ -103,7 +105,7 @@ def find_recording(path: Path) -> Path | None:
 
 
 def derive_data_name(data: Sequence[Path]) -> str:
-    """Return a name for outputs: that of the first data folder, or of the folder of the first file."""
+    """Return a name for outputs: that of the first path if it is a folder, else of the folder of this file."""
     first = resolve_path(data[0])
     return first.name if first.is_dir() else first.parent.name or first.stem
 

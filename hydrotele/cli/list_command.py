@@ -96,7 +96,13 @@ def format_items(kind: str, rows: list[dict], width: int) -> str:
 
 
 def _wrap_text(text: str, width: int, further_indent: str = "") -> list[str]:
-    """Wrap a text at its spaces; a word that is longer than the line stays whole."""
+    """Return the lines of a text wrapped at its spaces; a word longer than a line stays whole.
+
+    Args:
+        text: the text.
+        width: line length [characters].
+        further_indent: text before all lines but the first.
+    """
     return wrap(text, max(width, 1), subsequent_indent=further_indent, break_long_words=False, break_on_hyphens=False)
 
 
@@ -164,7 +170,7 @@ def _sweep_rows() -> list[dict]:
 
 
 def _effect_rows() -> list[dict]:
-    """Return a row for each effect, with the components of a machine that it can change.
+    """Return a row for each effect of the gap search, with the components of a machine that it can change.
 
     The components are those of one machine: of the CAT 215 with bucket if it supports the effect,
     otherwise of the first shipped machine that does. The parameter ranges are those of the last
@@ -200,7 +206,7 @@ def _effect_rows() -> list[dict]:
 
 
 def _environment_rows() -> list[dict]:
-    """Return a row for each gymnasium environment."""
+    """Return a row for each gymnasium environment: name, machine with tool, description and reward."""
     from hydrotele.envs.task_catalogue import TASKS
 
     return [

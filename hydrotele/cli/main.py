@@ -30,7 +30,7 @@ from hydrotele.core.errors import InputError
 
 
 def _load_effect_files(files: list[Path] | None) -> list[Path] | None:
-    """Load files of custom effects and laws, and return the list of files unchanged."""
+    """Execute Python files that define custom effects and laws; return the list of files unchanged."""
     if files:
         from hydrotele.effects import load_effects
 

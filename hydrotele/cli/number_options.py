@@ -22,7 +22,7 @@ class NumberCheckingGroup(TyperGroup):
     """Command group that rejects infinity and NaN as numbers of its commands and subgroups."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command that accepts only finite numbers."""
+        """Return the command or subgroup of a name, changed such that it rejects infinity and NaN as numbers."""
         command = super().get_command(ctx, cmd_name)
         for each in _iterate_leaf_commands(command):
             each.invoke = functools.partial(_invoke_with_finite_numbers, each, each.invoke)
@@ -40,7 +40,16 @@ def _iterate_leaf_commands(command: Any) -> Iterator[Any]:
 
 
 def _invoke_with_finite_numbers(command: Any, invoke: Any, ctx: Any) -> Any:
-    """Run a command after checking that its numbers are finite."""
+    """Run a command after checking that its numbers are finite; return its result.
+
+    Args:
+        command: the command, which declares the parameters.
+        invoke: function of the context that runs the command.
+        ctx: context with the values of the parameters.
+
+    Raises:
+        InputError: a number is infinite or NaN; the message names the option.
+    """
     for parameter in command.params:
         value = ctx.params.get(parameter.name)
         for number in value if isinstance(value, list | tuple) else (value,):

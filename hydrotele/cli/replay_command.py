@@ -81,7 +81,9 @@ def replay_logs(
 
 
 def _replayable_logs(opened: OpenedLogs) -> list[Log]:
-    """Return the runs, and pieces of interrupted runs, that have at least 10 rows; note the shorter ones.
+    """Return logs of the runs that have at least 10 rows, as one log per run or piece of an interrupted run.
+
+    Shorter ones are omitted, with a note on stderr.
 
     Raises:
         InputError: a run has no command of an axis.
@@ -96,7 +98,7 @@ def _replayable_logs(opened: OpenedLogs) -> list[Log]:
 
 
 def replay_to_dict(result: Replay) -> dict:
-    """Return the prediction errors of a replay as JSON data: log, machine, errors of each channel."""
+    """Return a replay as JSON data: log, machine, prediction errors of each channel, real-time factor."""
     return {
         "log": result.measured.source,
         "machine": result.simulated.metadata["machine"],

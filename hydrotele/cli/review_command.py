@@ -81,7 +81,17 @@ def review_logs(
 
 
 def _show(made: Path, outputs: ReviewOutputs) -> None:
-    """Take the screenshot of a recording, serve it, or open the viewer if no file was requested."""
+    """Take the requested screenshot of a recording, and serve the recording if a port is given.
+
+    If neither a file nor a port was requested, the viewer is opened.
+
+    Args:
+        made: recording file.
+        outputs: requested files and views.
+
+    Raises:
+        InputError: the viewer cannot be run.
+    """
     if outputs.screenshot:
         from hydrotele.show.rerun_viewer import take_screenshot
 

@@ -161,7 +161,17 @@ _MAX_LISTED_FAILURES = 10
 
 
 class SweepOptions(NamedTuple):
-    """Options of `hydrotele sweep` except the sweep file and the output folder."""
+    """Options of `hydrotele sweep` except the sweep file and the output folder.
+
+    Attributes:
+        jobs: number of processes, None for one per core.
+        dask: address or scheduler file of a dask cluster, None to run on this computer.
+        fresh: discard earlier results in the output folder instead of continuing with the missing
+            runs.
+        retry_failed: repeat runs that failed earlier.
+        strict: exit with status 3 if any run failed, not only if all failed.
+        json: print JSON instead of text.
+    """
 
     jobs: int | None
     dask: str | None
@@ -208,7 +218,13 @@ def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> No
 
 
 def _sweep_study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
-    """Return the data of the sweep report: result table, varied keys, results to show, failed runs."""
+    """Return the data of the sweep report: result table, varied keys, results to show, failed runs.
+
+    Args:
+        file: the sweep.
+        swept: result of the sweep.
+        figures: names of the results to show.
+    """
     sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
     logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
     return Study(

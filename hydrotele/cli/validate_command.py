@@ -61,9 +61,12 @@ def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | N
 
 
 def _validate_file(path: Path, log_machine: LogMachine, notes: list[str]) -> tuple[str, str]:
-    """Check a file, folder or shipped name; return its kind and a summary of its content.
+    """Check a file, folder or shipped name; return its kind and a summary of its content as text.
 
-    Notes on repairs of a log are appended to `notes`.
+    Args:
+        path: file, folder or shipped name of a machine, joystick, scenario, sweep or log.
+        log_machine: machine against which logs are checked.
+        notes: notes on repairs of a log are appended.
 
     Raises:
         InputError: the file is not valid or does not exist.
@@ -107,9 +110,15 @@ def _is_log_folder(path: Path) -> bool:
 
 
 def _check_logs(path: Path, log_machine: LogMachine, notes: list[str]) -> str:
-    """Check the logs of a path, against their machine if it is known; return a summary of their content.
+    """Check the logs at a path, against their machine if it is known; return a summary of their content.
 
-    Notes on repairs are appended to `notes`.
+    Args:
+        path: log file, folder of logs or run folder.
+        log_machine: machine against which the logs are checked, or how to find it.
+        notes: notes on repairs of the logs are appended.
+
+    Raises:
+        InputError: a log is not usable.
     """
     from hydrotele.cli.input_logs import find_machine_and_tool_names, open_logs
     from hydrotele.logs.dataset import make_dataset, merge_runs_without_machine
@@ -147,7 +156,10 @@ def _check_sweep(path: Path) -> str:
 
 
 def is_joystick(path: Path) -> bool:
-    """Return whether a name, folder or file describes a joystick."""
+    """Return whether a path is the name of a shipped joystick, or a folder or YAML file of a joystick.
+
+    A YAML file describes a joystick if it has the key `flotor`.
+    """
     if str(path) in shipped_joysticks() or (path / JOYSTICK_FILE).is_file():
         return True
     return path.suffix in (".yaml", ".yml") and path.is_file() and "flotor" in read_yaml(path)[0]

@@ -41,9 +41,11 @@ def arm_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def arm_specification(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
-    """Return kinematic parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
+    """Return kinematic parameters, axis names and joint ranges of a machine's arm.
 
-    The axes are ordered from swing outwards.
+    Returns:
+        (parameters (9,) of `kinematics.task_space.arm_parameters`, names of the k axes from swing
+        outwards, joint ranges (k, 2) [rad], infinite for a joint without a range).
 
     Raises:
         InputError: the machine has no arm, or a joint of its arm is not driven.
@@ -64,7 +66,8 @@ def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], wher
 
     Args:
         machine: the machine.
-        pose: target pose; without `attitude` the tool keeps that of `current`.
+        pose: target pose; without `attitude` or `head`, the tool keeps the attitude or head angle
+            that it has at the positions `current`.
         current: axis -> current position [rad].
         where: key path of the pose, for messages.
 

@@ -26,9 +26,10 @@ class Controller(NamedTuple):
 
     Attributes:
         parameters: (k, 14) of `control.servo.servo_parameters`.
-        closed: (k,) whether an axis is under feedback; the others keep their command.
-        load: (k,) slow mean of the drive forces, updated [N] or [N m].
-        command: (k,) written where closed [1], or in the drive's unit.
+        closed: (k,) whether the servo controls an axis by feedback; the others keep their command.
+        load: (k,) drive forces (minus computed forces, if any), low-pass filtered with the time
+            constant `Servo.load_time`; updated in every tick for hydraulic drives [N] or [N m].
+        command: (k,) commands of the drives; written where `closed` [1], or in the drive's unit.
     """
 
     parameters: np.ndarray
@@ -41,10 +42,10 @@ class TickReference(NamedTuple):
     """References of k axes in one tick.
 
     Attributes:
-        joint: (k,) joint references at the time of the measurement [rad] or [m].
-        drive: references of the drives.
+        joint: (k,) joint references at the time at which the joints were measured [rad] or [m].
+        drive: reference velocities of the drives, with moment arms and chamber volumes.
         computed: drive forces by inverse dynamics.
-        stopped: whether all commands are set to 0.
+        stopped: whether the commands of all axes are set to 0 in this tick.
     """
 
     joint: np.ndarray
@@ -59,7 +60,7 @@ def control_tick(sim, tick, steps, controller, reference, measured):
 
     Args:
         sim: Simulation; its state is advanced by one tick.
-        tick: control tick, from 0, scalar.
+        tick: index of the control tick, from 0, scalar.
         steps: physics steps per tick, scalar.
         controller: Controller; its `command` and `load` are updated.
         reference: TickReference.
@@ -84,13 +85,14 @@ class PlannedRun(NamedTuple):
     """Data of a run along a plan of n ticks and k axes.
 
     Attributes:
-        controller: the servo.
-        feedback: the sensors.
+        controller: state and parameters of the servo.
+        feedback: the sensors, their errors and their last readings.
         drives: references of the drives, (n, k) each.
-        forces: computed forces, (n, k) each.
+        forces: drive forces by inverse dynamics, (n, k) each.
         reference: (n, k) joint references [rad] or [m].
-        command: (n, k) commands of the axes without feedback [1], or in the drives' units.
-        given: (n, k) written: commands of every tick.
+        command: (n, k) planned commands, used for the axes without feedback [1], or in the drives'
+            units.
+        given: (n, k) written: commands of all axes in every tick, by servo or plan.
     """
 
     controller: Controller
@@ -117,7 +119,7 @@ PLANNED_RUN_DTYPE = np.dtype(
 
 
 def planned_run_record(run: PlannedRun) -> np.ndarray:
-    """Pack a `PlannedRun` into a record (1,) of sizes and array addresses; its arrays must outlive it."""
+    """Pack a `PlannedRun` into a record (1,) of sizes and array addresses; the arrays must outlive the record."""
     table, controller = run.feedback, run.controller
     arrays = {
         "parameters": controller.parameters, "closed": controller.closed, "load": controller.load,
@@ -169,9 +171,9 @@ def step_planned_run(simulated, planned, tick, steps, stopped):
     Args:
         simulated: record of `simulate.stepping.simulation_record`.
         planned: record of `planned_run_record`, with the readings of this tick.
-        tick: control tick, scalar.
+        tick: index of the control tick, from 0, scalar.
         steps: physics steps per tick, scalar.
-        stopped: whether all commands are 0, scalar.
+        stopped: whether the commands of all axes are set to 0 in this tick, scalar.
 
     Returns:
         Nothing.

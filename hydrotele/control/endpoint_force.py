@@ -55,14 +55,16 @@ class DriveReadings(NamedTuple):
 
     Attributes:
         period: time between two readings of the sensors [s].
-        settle: number of initial readings that are averaged.
-        tables: (2, 3, 5) tables of the reading filter and the force filter.
-        position: (n,) column of the axis of each coordinate.
-        valve: (h,) column of the axis of each valve.
+        settle: number of initial readings that are averaged instead of filtered.
+        tables: (2, 3, 5) tables of the filter of positions and pressures, and of the filter of the
+            force.
+        position: (n,) index, in the readings, of the axis that drives each coordinate.
+        valve: (h,) index, in the readings, of the axis of each valve.
         state: (n + 2 h + m, 4) filter states: positions, pressures, force at the tip.
         outside: (n,) external forces on the coordinates [N m] or [N].
-        last: (3, k) last valid readings of joint, head and rod; NaN before the first.
-        still: (3, k) number of readings since the last change.
+        last: (3, k) last valid readings; rows joint position, head and rod pressure; NaN before the
+            first.
+        still: (3, k) number of readings since the last change of the reading, rows as for `last`.
     """
 
     period: float
@@ -83,18 +85,20 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     Args:
         arm: ArmBalance.
         readings: DriveReadings.
-        dynamic: whether the complete model is used, or gravity only; scalar.
-        count: number of previous readings; scalar. The first ones are averaged, assuming a machine
-            at rest.
+        dynamic: whether the complete model is used; otherwise the static model of gravity only;
+            scalar.
+        count: number of previous readings; scalar. The first `settle` readings are averaged,
+            assuming a machine at rest.
         joint: (k,) measured joint positions [rad] or [m].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        out: (m,) written: force at the tip along r [N], theta [N m], z [N], then attitude and head [N m].
+        out: (m,) written: force at the tip along r [N], theta [N m], z [N], then attitude and head
+            [N m].
 
     Returns:
-        STATUS_WAITING until every channel has a reading, STATUS_GOOD, STATUS_BAD if a reading was not
-        finite and was replaced by the last one, STATUS_SINGULAR if the arm is singular and `out` is
-        unchanged.
+        STATUS_WAITING until every channel has a reading, STATUS_GOOD, STATUS_BAD if a reading was
+        not finite and was replaced by the last one, STATUS_SINGULAR if the arm is singular and
+        `out` is unchanged.
 
     Source: Zhu 1994, 6.1.
     """
@@ -144,9 +148,10 @@ def _reset_filter(state, value):
 
 @compile_without_allocation
 def _get_reading(r, c):
-    """Return the index of signal c in the arm's state vector, and the last valid reading of its sensor.
+    """Return the index of signal c in the arm's state vector `z`, and the last valid reading of its sensor.
 
-    The signals are the joint positions, then head and rod pressure of every valve.
+    The signals are the positions of the n coordinates, then head and rod pressure of every valve.
+    `r` is DriveReadings.
     """
     n = len(r.position)
     if c < n:
@@ -157,7 +162,7 @@ def _get_reading(r, c):
 
 @compile_without_allocation
 def _store_readings(last, still, used, values):
-    """Store the finite ones of new readings, and count how long each channel has not changed.
+    """Store new readings if they are finite, and count for how many readings each channel has not changed.
 
     Args:
         last: (k,) last valid readings, updated.
@@ -218,7 +223,8 @@ def _update_force_from_records(arm, kept, dynamic, count, joint, head, rod, out)
     """Unpack the records of arm and readings and update the force at the tip (`endpoint_force_step`).
 
     Returns:
-        Status of the update, and the number of readings since the longest constant channel changed.
+        (status of `endpoint_force_step`, largest number of readings for which a channel has not
+        changed).
     """
     r = kept[0]
     still = int64_view(r.still, 3 * r.axes).reshape((3, r.axes))
@@ -263,13 +269,14 @@ class EndpointForce:
             axes: order of the readings, as in `Feedback.joint`.
             kind: `static` models gravity only, `dynamic` uses the complete model.
             period: time between two updates [s].
-            every: updates per sample of the sensors, as in `Feedback.ticks_per_sample`. The first update uses
-                a new sample, the following ones have no effect.
+            every: updates per sample of the sensors, as in `Feedback.ticks_per_sample`. Of each
+                `every` updates the first uses a new sample, and the others have no effect.
             sensors: sensor set of the machine; its noise affects friction in the dynamic estimate.
                 None for ideal sensors.
             gravity: parameters of the static model; None to compute them from the machine's masses.
             bandwidth: bandwidth of the estimate [Hz].
-            motion_bandwidth: bandwidth of the motion from which friction and inertia are computed [Hz].
+            motion_bandwidth: bandwidth of the motion from which friction and inertia are computed
+                [Hz].
 
         Raises:
             InputError: a joint is not driven by a valve or not measured, or a value is invalid.
@@ -326,11 +333,11 @@ class EndpointForce:
         return self.force
 
     def find_constant_channels(self, duration: float = 0.5) -> tuple[str, ...]:
-        """Return the channels whose readings have not changed, as with a stuck sensor.
+        """Return the names of the channels whose readings have not changed for a time, as with a stuck sensor.
 
         Args:
-            duration: time without change [s]. Readings of real sensors do not stay constant for
-                long; those of ideal sensors of a machine at rest do.
+            duration: minimum time without change up to the last reading [s]. Noise changes the
+                readings of real sensors; those of ideal sensors of a machine at rest stay constant.
 
         Returns:
             Names such as `joint.boom`, `pressure_head.boom`.

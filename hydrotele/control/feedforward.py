@@ -22,13 +22,14 @@ _REFERENCE_CUTOFF_HZ = 8.0  # Hz, cutoff that removes steps and corners of table
 
 
 def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
-    """Compute the drive forces that a plan requires, by inverse dynamics of the machine `servo.force_model`.
+    """Compute the drive forces that a plan requires, and their rates, by inverse dynamics of a machine model.
 
     Args:
         machine: machine of the scenario, without added effects.
         plan: joint references; all axes must be under feedback.
-        servo: `force_model` is the name of the machine whose dynamics are used, `nominal` for `machine`;
-            the rates of the forces are advanced by `lead` [s] against the spool's lag.
+        servo: `force_model` is the name of the machine model whose dynamics are used, `nominal` for
+            `machine`. The rates of the forces are those `lead` [s] later, which compensates the
+            spool's lag.
 
     Returns:
         The force references, all zero if `force_model` is None.
@@ -72,9 +73,10 @@ def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> Forc
 
 
 def _smooth_and_differentiate_reference(reference: np.ndarray, step: float) -> SmoothedSignal:
-    """Return a joint reference (n, k) with its rates and accelerations, low-pass filtered without delay.
+    """Return a joint reference (n, k) with its rates and accelerations, low-pass filtered at 8 Hz without delay.
 
-    `step` is the time between rows [s]. A reference that is too short is not filtered.
+    `step` is the time between rows [s]. A reference shorter than 0.6 s is not filtered; its rates
+    and accelerations are then difference quotients.
     """
     if len(reference) > 5.0 / (_REFERENCE_CUTOFF_HZ * step):
         return filter_zero_phase(reference, step, _REFERENCE_CUTOFF_HZ)

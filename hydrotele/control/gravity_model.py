@@ -47,13 +47,14 @@ class GravityModel:
     """Parameters of the static gravity model.
 
     Attributes:
-        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5, where C23 is
-            cos(q2 + q3) and so on.
+        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5, where
+            C23 is cos(q2 + q3) and so on.
         value: (p,) parameters [N m].
         ci95_half_width: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
-        history: (r, p) parameters after every equation [N m]; empty if computed from masses.
-        residual: (m - 1,) RMS of the residual torques, from the boom outwards [N m].
-        outlier_indices: (q,) indices of equations removed as outliers, sorted.
+        history: (r, p) parameters after each of r instants of the identification [N m]; empty if
+            computed from masses.
+        residual: (m - 1,) RMS of the residual torques of each joint from the boom outwards [N m].
+        outlier_indices: (q,) indices of the instants removed as outliers, sorted.
     """
 
     names: tuple[str, ...]
@@ -120,9 +121,12 @@ def fit_gravity_to_masses(machine: Machine) -> GravityModel:
 
 @compiled
 def _gravity_torques(arm, poses, torque):
-    """Compute the gravity torques on the m joints of an arm in r `poses` (r, m) [rad].
+    """Compute the gravity torques on the m joints of an arm at rest in r poses, by the complete model.
 
-    They are written to `torque` (r, m) [N m].
+    Args:
+        arm: ArmBalance; its positions are overwritten.
+        poses: (r, m) joint angles [rad].
+        torque: (r, m) written: torques that hold the arm [N m].
     """
     outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
@@ -134,13 +138,13 @@ def _gravity_torques(arm, poses, torque):
 
 
 class SlowMotion(NamedTuple):
-    """Filtered signals of slow motion of an arm with m joints, r rows.
+    """Low-pass filtered signals of slow motion of an arm with m joints at r instants.
 
     Attributes:
         angle: (r, m) joint angles [rad].
-        torque: (r, m) torques of the drives [N m].
-        friction_torque: (r, m) torque per newton of dry friction of the drive, with the sign of the joint rate
-            [m]; 0 if the drive may be at rest.
+        torque: (r, m) torques of the drives on the joints [N m].
+        friction_torque: (r, m) torque per newton of dry friction of the drive, with the sign of the
+            joint rate [m]; 0 if the drive may be at rest.
     """
 
     angle: np.ndarray
@@ -149,9 +153,10 @@ class SlowMotion(NamedTuple):
 
 
 def extract_slow_motion(machine: Machine, log: Log, period: float = EQUATION_PERIOD_S) -> SlowMotion:
-    """Compute joint angles and drive torques of an arm from a log of slow motion.
+    """Compute joint angles and drive torques of an arm from a log of slow motion, low-pass filtered at 1 Hz.
 
-    Cylinder forces are converted to torques by virtual work through the linkages.
+    Drive forces follow from the pressures. They are converted to joint torques by virtual work
+    through the linkages.
 
     Args:
         machine: the machine.
@@ -159,7 +164,7 @@ def extract_slow_motion(machine: Machine, log: Log, period: float = EQUATION_PER
         period: time between rows [s], rounded to a multiple of the log's period.
 
     Returns:
-        One row per period.
+        The filtered signals, one row per period.
 
     Raises:
         InputError: a channel is missing, or a joint is not driven by a valve.
@@ -190,26 +195,29 @@ def identify_gravity(
 ) -> GravityModel:  # fmt: skip
     """Identify the static gravity model from a log of slow motion by recursive least squares.
 
-    With `remove_outliers`, equations with large residuals, as during a temporary sensor failure,
-    are removed and the estimation is repeated until none is left. By Chauvenet's criterion, a
-    residual is large if less than half an equation is expected to exceed it. The expected normal
-    distribution has the scale of the median absolute residual of the joint.
+    Every `period` gives an instant with one torque equation per joint, except the swing joint. With
+    `remove_outliers`, instants with a large residual, as during a temporary sensor failure, are
+    removed and the estimation is repeated until none is left. By Chauvenet's criterion, the
+    residual of a joint is large if less than half a residual of this size or larger is expected in
+    all instants. The expected distribution is normal, with its scale from the joint's median
+    absolute residual.
 
     Args:
         machine: the machine; its masses are not used.
         log: measured angles and pressures of joints that move slowly back and forth over their
             ranges.
-        friction: whether dry friction of every drive is estimated as well. If not, it averages out
-            in the torques, as in Zhu.
-        remove_outliers: whether equations with large residuals are removed.
-        period: time between equations [s].
+        friction: whether dry friction of every drive is estimated as well. If not, friction is
+            assumed to average out over both directions of motion, as in Zhu.
+        remove_outliers: whether instants with large residuals are removed.
+        period: time between the instants [s].
 
     Returns:
-        The parameters with their history.
+        The gravity parameters with their intervals, their history, the RMS residuals, and the
+        removed instants.
 
     Raises:
-        InputError: a channel is missing, the log is too short, or too few equations are left after
-            removing outliers.
+        InputError: a channel is missing, the log is too short, or fewer than 50 instants are left
+            after removing outliers.
 
     Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
     """
@@ -249,7 +257,8 @@ def _solve_recursively(
     Args:
         rows: (r, m - 1, p) regressors of r instants, without the swing joint.
         torque: (r, m - 1) torques of the drives [N m].
-        size: number of gravity parameters, which come first; the others are dry friction.
+        size: number of gravity parameters, which are the first of the p parameters; the others are
+            the dry friction of the drives.
 
     Returns:
         The estimator with the final parameters P, and the gravity parameters (size,) after every
@@ -265,10 +274,12 @@ def _solve_recursively(
 
 
 def _are_outliers(residuals: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return for each instant (r,) whether a residual `residuals` (r, m - 1) is an outlier (Chauvenet's criterion).
+    """Return for each instant (r,) whether the residual of any joint is an outlier (Chauvenet's criterion).
 
-    The scale of the residuals is computed only from the instants with `kept` (r,) True, the others having been
-    removed as outliers before.
+    Args:
+        residuals: (r, m - 1) residual torques of the joints [N m].
+        kept: (r,) False for instants that were removed before. The scale of the residuals, from
+            their median absolute value per joint, and the number of instants count only the others.
     """
     from scipy.special import ndtri  # imported here, because runs do not need it
 

@@ -78,7 +78,7 @@ def check_command(machine: Machine, name: str, command: np.ndarray) -> None:
 
 
 def note_early_end(time: np.ndarray, pilot_duration: float) -> tuple[str, ...]:
-    """Return a message if the run ends before all motions of its pilot are finished.
+    """Return a message if a run ends before all motions of its pilot (the intended motion) are finished.
 
     Args:
         time: (n,) times of the control ticks [s].
@@ -93,16 +93,18 @@ def note_early_end(time: np.ndarray, pilot_duration: float) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """Commands or references of every axis at every control tick.
+    """Open-loop command or joint reference of every axis at every control tick.
 
     Attributes:
         time: (n,) times of the control ticks [s].
         axes: axis names in the order of the columns.
-        command: (n, k) open-loop commands [1], or in the drive's unit.
-        reference: (n, k) joint references [rad] or [m].
+        command: (n, k) open-loop commands [1], or in the drive's unit; used where `closed_loop` is
+            False.
+        reference: (n, k) joint references [rad] or [m]; used where `closed_loop` is True.
         rate: (n, k) rates of the references [rad/s] or [m/s].
-        closed_loop: (k,) whether the axis follows its reference.
-        pose: (n, 4 or 5) desired r, theta, z, attitude and head angle of the tip, or None.
+        closed_loop: (k,) whether the servo moves the axis along its reference.
+        pose: (n, 4 or 5) reference r [m], theta [rad], z [m], attitude [rad] and head angle [rad]
+            of the tip; None if the pilot has no tip motion.
         notes: sentences about motions that cannot be followed.
     """
 
@@ -166,9 +168,11 @@ def _build_plan(
 
 
 def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
-    """Return the plan of a teleoperated run, whose joint references are written during the run.
+    """Return the plan of a teleoperated run, with its open-loop commands and arrays for the references.
 
-    Buttons of the operator set open-loop commands of their axes from given times on.
+    Joint references and tip pose are written during the run. Buttons of the operator set open-loop
+    commands of axes outside the arm, each from a given time on. All other axes except force drives
+    follow references.
     """
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
     for button in sorted(pilot.buttons, key=lambda button: button.start):
@@ -209,7 +213,9 @@ def _plan_from_table(plan: Plan, pilot: TablePilot) -> Plan:
 def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:
     """Return a plan with Fourier series as joint references, faded in from the start position.
 
-    `reference = start + s(t) (wave - start)` with the smooth step s of `quintic_step`.
+    `reference = start + s(t) (wave - start)` with the Fourier series `wave`, and the smooth step s
+    of `quintic_step` with the duration `pilot.fade`. Axes in `pilot.closed_valves` have the
+    open-loop command 0.
     """
     s, ds = quintic_step(plan.time, pilot.fade)
     omega = 2.0 * math.pi / pilot.period
@@ -251,9 +257,13 @@ def quintic_step(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndar
 
 
 def _trapezoidal_speed(time: np.ndarray, distance: float, speed: float, acceleration: float):
-    """Return the speed (n,) at given times of a move with a trapezoidal speed profile, and its duration [s].
+    """Return the speed (n,) at given times of a move with a trapezoidal speed profile, and the move's duration [s].
 
-    `time` (n,) counts from the start of the move [s]. `distance` [m] or [rad] is its length.
+    Args:
+        time: (n,) times since the start of the move [s].
+        distance: length of the move [m] or [rad], > 0.
+        speed: largest speed [m/s] or [rad/s]; a short move does not reach it.
+        acceleration: acceleration and deceleration [m/s^2] or [rad/s^2].
     """
     ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
     cruise = distance / (ramp * acceleration) - ramp

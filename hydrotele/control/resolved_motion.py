@@ -1,11 +1,12 @@
 """Resolved motion in cylindrical coordinates (r, theta, z, attitude, head), by rate or position.
 
-`step_references_to_pose` computes joint references by inverse kinematics and their rates by the inverse
-Jacobian, so that no error is integrated. If a step would leave the workspace or a joint range, the
-reference is held and `is_blocked` is set until the command returns to the held pose.
+`step_references_to_pose` computes joint references by inverse kinematics and their rates by the
+inverse Jacobian, so that no error is integrated. If a step would leave the workspace or a joint
+range, the reference is held and `is_blocked` is set until the command returns to the held pose.
 
-`step_references_by_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
-measured joint angles, integrated to references. Errors of the direction accumulate.
+`step_references_by_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse
+Jacobian at the measured joint angles, integrated to references. Errors of the direction of motion
+accumulate.
 """
 
 import dataclasses
@@ -27,18 +28,20 @@ _RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: a
 
 @compiled
 def step_references_to_pose(arm_constants, ranges, target, rate, blocked, pose, q, speed):
-    """Set joint references to the inverse kinematics of a target pose, or hold them if it is out of reach.
+    """Set joint references to the inverse kinematics of a target pose of the tip, or hold them.
+
+    They are held if the target is out of reach or singular, needs an angle outside a joint range,
+    or, after a held step, is farther than 0.02 m or rad from the held pose in any coordinate.
 
     Args:
         arm_constants: (9,) parameters of the arm, of `kinematics.task_space.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         target: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) time derivative of the target [m/s], [rad/s].
-        blocked: whether the last step was held, scalar; then only a pose near the held one releases
-            the references.
-        pose: (5,) pose of the references, updated.
-        q: (k,) joint references, updated [rad].
-        speed: (k,) their rates, written; 0 while held [rad/s].
+        blocked: whether the references were held in the last step, scalar.
+        pose: (5,) tip pose that belongs to the joint references, updated unless held.
+        q: (k,) joint references, updated unless held [rad].
+        speed: (k,) rates of the joint references, written; 0 while held [rad/s].
 
     Returns:
         Whether the references were held, as a scalar.
@@ -80,13 +83,13 @@ def step_references_by_rate(arm_constants, ranges, measured, rate, period, pose,
         measured: (k,) joint angles at which the Jacobian is evaluated [rad].
         rate: (5,) rate of r, theta, z, attitude and head [m/s], [rad/s].
         period: integration period, scalar [s].
-        pose: (5,) pose of the references, updated [m], [rad].
-        q: (k,) joint references, updated [rad].
-        speed: (k,) their rates, written; 0 while held [rad/s].
+        pose: (5,) tip pose that belongs to the joint references, updated unless held [m], [rad].
+        q: (k,) joint references, updated unless held [rad].
+        speed: (k,) rates of the joint references, written; 0 while held [rad/s].
 
     Returns:
-        Whether the references were held, as a scalar: the arm is singular, a joint would leave its
-        range, or a measured angle is not finite.
+        Whether the references were held, as a scalar. They are held if the arm is singular, a joint
+        reference would leave its range, or a measured angle is not finite.
 
     Source: Zhu 1994, Eq. 2.1.
     """
@@ -113,15 +116,17 @@ def step_references_by_rate(arm_constants, ranges, measured, rate, period, pose,
 
 @dataclasses.dataclass(frozen=True)
 class ResolvedMotion:
-    """State of the resolved-motion controller.
+    """State of the resolved-motion controller, which converts motion of the tip to joint references.
 
     Attributes:
-        arm_geometry_parameters: (9,) parameters of the arm, of `kinematics.task_space.arm_parameters`.
+        arm_geometry_parameters: (9,) parameters of the arm, of
+            `kinematics.task_space.arm_parameters`.
         axes: k axis names from swing outwards, 3 to 5.
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.
-        pose: desired r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
-        is_blocked: whether the last step was held at a limit of the workspace.
+        pose: reference r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
+        is_blocked: whether the references were held in the last step, at a limit of workspace or
+            joints.
     """
 
     arm_geometry_parameters: np.ndarray
@@ -133,7 +138,7 @@ class ResolvedMotion:
 
     @staticmethod
     def from_joints(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
-        """Create the state of the controller at given positions of the axes (name -> [rad]).
+        """Create the state of the controller whose references are given joint positions (axis name -> [rad]).
 
         Raises:
             InputError: the machine has no arm.
@@ -145,7 +150,10 @@ class ResolvedMotion:
         return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
 
     def step_by_rate(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
-        """Advance the references by a rate command of the tip that is constant for dt.
+        """Advance the references by a rate of the tip that is constant for dt.
+
+        The reference pose changes by `rate` times `dt`; `step_to_pose` converts it to joint
+        references.
 
         Args:
             rate: (4,) or (5,) dr/dt [m/s], dtheta/dt [rad/s], dz/dt [m/s], dattitude/dt [rad/s],
@@ -153,20 +161,22 @@ class ResolvedMotion:
             dt: duration [s].
 
         Returns:
-            (next state, axis -> position [rad], axis -> velocity [rad/s]).
+            (next state, axis -> joint reference [rad], axis -> rate of the reference [rad/s]).
         """
         wanted = tuple(p + v * dt for p, v in zip(self.pose, rate, strict=False))
         return self.step_to_pose(wanted, rate)
 
     def step_to_pose(self, target, rate) -> tuple["ResolvedMotion", dict, dict]:
-        """Set the references to a target pose of the tip and convert its rate to joint rates.
+        """Set the joint references to a target pose of the tip, and convert the rate of this pose to joint rates.
+
+        The references are held at a limit; see `step_references_to_pose`.
 
         Args:
             target: (4,) or (5,) target r [m], theta [rad], z [m], attitude [rad], head [rad].
             rate: (4,) or (5,) time derivative of the target [m/s], [rad/s].
 
         Returns:
-            (next state, axis -> position [rad], axis -> velocity [rad/s]).
+            (next state, axis -> joint reference [rad], axis -> rate of the reference [rad/s]).
         """
         pose, q, speed = _pad_to_five(self.pose), np.array(self.joints), np.zeros(len(self.axes))
         blocked = step_references_to_pose(

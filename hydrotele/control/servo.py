@@ -5,9 +5,10 @@ the measured pressures. This remains accurate during oil compression at reversal
 steady-state flow gain causes errors of centimetres. It also removes the damping by the orifices, so
 the deviation of the force from its expected value is fed back as a velocity.
 
-The expected force is the slow mean of the force, or, with computed forces, the force by inverse
-dynamics along the reference. In the latter case the compression flow of that force's rate is fed
-forward as well, and a force drive receives the force itself.
+The expected force is the drive force, low-pass filtered with the time constant `Servo.load_time`.
+With computed forces it is the force by inverse dynamics along the reference, plus the low-pass
+filtered difference of drive force and computed force. The compression flow due to the rate of the
+computed force is then fed forward as well, and a force drive receives the computed force itself.
 
 `compute_drive_references` and `interpolate_drive_reference` compute moment arms and chamber volumes
 along the reference.
@@ -41,11 +42,13 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
         dt: control period [s].
 
     Returns:
-        (k, 14): kind (1 hydraulic with valve, 0 force drive), head and rod area [m^2], flow gain
-        [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force per command, position
-        gain [1/s], velocity gain (force drives), deadband compensation [1], weight with which
-        each control period adds the present drive force to its slow mean [1], bulk modulus [Pa], gain of
-        the feedback of drive force minus slow mean [1/s].
+        (k, 14), with the columns: kind (1 hydraulic with valve, 0 otherwise), head and rod area
+        [m^2], flow gain [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force
+        per command, position gain [1/s], velocity gain of force drives [N s/m] or [N m s/rad],
+        fraction of the deadband that is compensated [1], weight of a new drive force in its
+        low-pass filter (1 - exp(-dt / `load_time`)) [1], bulk modulus [Pa], and
+        `pressure_feedback`, the gain from the deviation of the drive force from its expected value
+        to a velocity [1/s].
 
     Raises:
         InputError: a gain is given for an unknown axis.
@@ -74,13 +77,14 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
 
 
 class DriveReferences(NamedTuple):
-    """References of the drives along a plan, all (n, k).
+    """References of k drives at n control ticks of a plan, all (n, k).
 
     Attributes:
-        velocity: reference velocity, that of the time plus the servo's lead [m/s] or [rad/s].
-        arm: moment arm d(drive)/d(joint) at the reference.
-        volume_head: head chamber volume at the reference [m^3].
-        volume_rod: rod chamber volume at the reference [m^3].
+        velocity: reference velocity of the drive, `Servo.lead` later than the tick, times
+            `Servo.feedforward` [m/s] or [rad/s].
+        arm: moment arm d(drive)/d(joint) at the joint reference of the tick.
+        volume_head: head chamber volume at this joint reference [m^3].
+        volume_rod: rod chamber volume at this joint reference [m^3].
     """
 
     velocity: np.ndarray
@@ -90,16 +94,16 @@ class DriveReferences(NamedTuple):
 
 
 def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferences:
-    """Compute drive velocities, moment arms and chamber volumes along a plan.
+    """Compute drive velocities, moment arms and chamber volumes along the joint references of a plan.
 
     Args:
         machine: the machine.
         plan: joint references.
-        servo: its `lead` [s] shifts the velocities forward in time, against the spool's lag; its
-            `feedforward` [1] scales them.
+        servo: the velocity at a tick is that of the plan `lead` [s] later, which compensates the
+            spool's lag, times `feedforward` [1].
 
     Returns:
-        The references.
+        The references. For axes without feedback, velocities are 0, moment arms and volumes 1.
 
     Raises:
         InputError: the plan has a reference for an axis with its own pump.
@@ -130,9 +134,10 @@ def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> Driv
 def compute_valve_opening(velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain):
     """Compute the valve opening at which a piston moves at a velocity with constant force.
 
-    `A_h p_A' = A_r p_B'`, where ' is d/dt, with the orifice flows at the given pressures gives
-    `o = v (A_h^2/V_A + A_r^2/V_B) / (k (A_h/V_A sqrt(dp_A) + A_r/V_B sqrt(dp_B)))` with the pressure
-    drops dp_A and dp_B of the valve edges at the two chambers.
+    `A_h p_A' = A_r p_B'`, where ' is d/dt, with the orifice flows at the given pressures gives `o =
+    v (A_h^2/V_A + A_r^2/V_B) / (k (A_h/V_A sqrt(dp_A) + A_r/V_B sqrt(dp_B)))` with the pressure
+    drops dp_A and dp_B of the valve edges at the two chambers. The denominator is at least that
+    with drops of 2 % of the supply pressure.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s], positive extends.
@@ -164,13 +169,13 @@ def compute_valve_opening(velocity, head, rod, supply, tank, area_head, area_rod
 
 
 class DriveReference(NamedTuple):
-    """References of k drives for one control period, as `interpolate_drive_reference` writes them.
+    """References of k drives for one control period: a row of `DriveReferences`.
 
     Attributes:
-        velocity: (k,) reference velocity, that of the time plus the servo's lead [m/s] or [rad/s].
-        arm: (k,) moment arm d(drive)/d(joint) at the reference.
-        volume_head: (k,) head chamber volume [m^3].
-        volume_rod: (k,) rod chamber volume [m^3].
+        velocity: (k,) reference velocity of the drive [m/s] or [rad/s].
+        arm: (k,) moment arm d(drive)/d(joint) at the joint reference.
+        volume_head: (k,) head chamber volume at the joint reference [m^3].
+        volume_rod: (k,) rod chamber volume at the joint reference [m^3].
     """
 
     velocity: np.ndarray
@@ -201,9 +206,10 @@ class ComputedForce(NamedTuple):
     """Drive forces by inverse dynamics at one control tick.
 
     Attributes:
-        is_computed: whether they were computed; otherwise the arrays are not used.
-        force: (k,) current forces [N] or [N m].
-        rate: (k,) rates of change, those of the time plus the servo's lead [N/s] or [N m/s].
+        is_computed: whether the forces were computed; otherwise the arrays are not used.
+        force: (k,) forces at this tick [N] or [N m].
+        rate: (k,) time derivatives of the forces, `Servo.lead` later than the tick [N/s] or [N
+            m/s].
     """
 
     is_computed: bool
@@ -215,9 +221,9 @@ class ForceReferences(NamedTuple):
     """Drive forces by inverse dynamics along a plan, (n, k) each.
 
     Attributes:
-        is_computed: whether they were computed.
-        force: forces [N] or [N m]; 0 if not computed.
-        rate: rates of change, those of the time plus the servo's lead [N/s] or [N m/s].
+        is_computed: whether the forces were computed.
+        force: forces at each tick [N] or [N m]; 0 if not computed.
+        rate: time derivatives of the forces, `Servo.lead` later than each tick [N/s] or [N m/s].
     """
 
     is_computed: bool
@@ -229,15 +235,21 @@ class ForceReferences(NamedTuple):
 def servo_step(parameters, closed, drive, reference, measured, load, computed, out):
     """Compute the servo commands of all axes for one control period.
 
+    The command of a valve follows from the reference velocity, the position error, and the
+    deviation of the drive force from its expected value; `compute_valve_opening` converts the sum
+    of these velocities. The command of a force drive follows from position and velocity error, and
+    the computed force.
+
     Args:
         parameters: (k, 14) of `servo_parameters`.
-        closed: (k,) whether the axis is under feedback; the others keep `out`.
+        closed: (k,) whether the axis is under feedback; the commands of the others are not changed.
         drive: DriveReference.
         reference: (k,) joint reference at the time of the joint measurement [rad] or [m].
         measured: MeasuredState.
-        load: (k,) slow mean of the drive force, updated [N] or [N m].
+        load: (k,) low-pass filtered drive force minus computed force (0 if not computed), updated
+            for hydraulic drives [N] or [N m].
         computed: ComputedForce.
-        out: (k,) commands, written where closed [1] or in the drive's unit.
+        out: (k,) commands, written where `closed` [1] or in the drive's unit.
 
     Returns:
         Nothing.
@@ -283,15 +295,15 @@ _DEFAULT_HALF_RANGE = 1.0  # rad or m, half range for a joint without a range; i
 
 
 def tabulate_drive_geometry(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate moment arms and chamber volumes over the joints' ranges.
+    """Tabulate the moment arms and chamber volumes of all drives over their joints' ranges.
 
     Args:
         machine: the machine.
         axes: axis names in column order.
 
     Returns:
-        (grid (k, 2): lowest joint position and step [rad] or [m]; table (k, TABLE_POINTS, 3): moment
-        arm d(drive)/d(joint), head and rod chamber volume [m^3]).
+        (grid (k, 2): lowest joint position and step [rad] or [m]; table (k, TABLE_POINTS, 3):
+        moment arm d(drive)/d(joint), head and rod chamber volume [m^3]).
     """
     grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), TABLE_POINTS, 3))
     for i, name in enumerate(axes):

@@ -74,7 +74,7 @@ def butterworth_response(bandwidth: float, s: np.ndarray) -> np.ndarray:
 
 
 def filter_noise_gains(table: np.ndarray) -> np.ndarray:
-    """Return the standard deviations of filter output and derivatives for white noise of unit deviation.
+    """Return the standard deviations of filter output and derivatives, for white noise of standard deviation 1.
 
     Args:
         table: (3, 5) of `filter_step_matrix`.

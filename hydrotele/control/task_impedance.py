@@ -23,8 +23,14 @@ class RecursiveLeastSquares:
     """Recursive least squares for `y = phi . theta` with regressor phi and parameters theta.
 
     A forgetting factor below 1 reduces the weight of old equations, so that parameters may drift.
-    Without excitation, forgetting would increase the covariance without limit, so its trace is
-    bounded. A sudden change, an error many times larger than usual, resets the covariance.
+    Without excitation, forgetting would increase the covariance without limit. Its trace is
+    therefore limited to the initial trace. A prediction error larger than `reset_ratio` times its
+    usual size resets the covariance to its initial value.
+
+    Attributes:
+        value: (p,) present parameters theta.
+        covariance: (p, p) their covariance, relative to the variance of the equations' error.
+        resets: number of resets of the covariance.
     """
 
     def __init__(
@@ -37,7 +43,8 @@ class RecursiveLeastSquares:
             start: (p,) initial parameters.
             initial_std: (p,) their standard deviations, relative to that of the equations' error.
             forgetting: forgetting factor per equation, above 0, at most 1.
-            reset_ratio: multiple of the usual error above which the covariance is reset.
+            reset_ratio: multiple of the usual prediction error (RMS of recent equations) above
+                which the covariance is reset, above 1.
 
         Raises:
             InputError: sizes do not match or a value is invalid.
@@ -91,7 +98,11 @@ class RecursiveLeastSquares:
         return error
 
     def _detect_sudden_change(self, error: float) -> bool:
-        """Return whether a prediction error is far above its usual size; otherwise update the usual size."""
+        """Return whether a prediction error exceeds `reset_ratio` times its usual size; otherwise update this size.
+
+        The usual size is the RMS of the previous errors, with more weight for the last 50. During
+        the first 5 p equations of p parameters, the result is always False.
+        """
         known = self._count >= 5 * len(self.value)
         if known and error**2 > self._reset_ratio**2 * self._mean_square_error:
             return True
@@ -131,7 +142,7 @@ class TaskImpedance:
         *,
         force_is_filtered: bool,
     ) -> None:
-        """Start without contact.
+        """Prepare the filters, and set all estimates to 0, as without contact.
 
         Args:
             coordinates: number k of task coordinates.
@@ -148,7 +159,7 @@ class TaskImpedance:
         self._force_states = None if force_is_filtered else self._position_states.copy()
 
     def update(self, force: np.ndarray, pose: np.ndarray) -> None:
-        """Update the estimate with one sample; skip it if it is not finite.
+        """Update stiffness, damping and mass with one sample of force and pose; skip a sample that is not finite.
 
         Args:
             force: (k,) force of the environment on the tip [N], [N m].
@@ -166,9 +177,12 @@ class TaskImpedance:
             self._update_coordinate_fit(c, felt, *motion)
 
     def _filter_reading(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
-        """Pass a reading of coordinate c through all filters; return its value and two derivatives.
+        """Pass a reading of coordinate c through all filters in series.
 
-        The filters start at rest at the first reading.
+        The filters start at rest at the first reading. `states` (filters, k, 4) is updated.
+
+        Returns:
+            (filtered value, its first and its second time derivative).
         """
         for table, state in zip(self._tables, states[:, c], strict=True):
             if np.isnan(state[VALUE]):
@@ -181,8 +195,9 @@ class TaskImpedance:
     def _update_coordinate_fit(self, c: int, force: float, position: float, rate: float, acceleration: float) -> None:
         """Update stiffness, damping and mass along coordinate c with one sample; set them to 0 without contact.
 
-        A force of at most `_MIN_CONTACT_FORCE_N` means no contact. The sample gives one equation of the
-        model `F = -(K x + B v + M a + c)`.
+        A force of at most 500 N or N m means no contact. The sample gives one equation of the model
+        in the class docstring. At the start of a contact the estimation starts anew, with
+        displacement 0. Negative estimates are replaced by 0.
         """
         if not abs(force) > _MIN_CONTACT_FORCE_N:
             self._fits[c] = None

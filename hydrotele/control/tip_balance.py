@@ -30,7 +30,7 @@ _MIN_PIVOT_RATIO = 1.0e-6  # pivot over largest entry, below which a Jacobian is
 class BalanceModel(NamedTuple):
     """The attributes of `estimate.reduced_model.Model` that a force balance needs.
 
-    Only these are passed, because each array passed from Python takes a tenth of a microsecond.
+    The others are omitted, because passing an array from Python to compiled code takes 0.1 us.
     """
 
     mech: ReducedMechanism
@@ -58,9 +58,10 @@ class ArmBalance(NamedTuple):
             the last two are its pressures [Pa].
         joint: (m,) index of the independent coordinate of every joint, swing first.
         task: (9,) of `kinematics.task_space.arm_parameters`.
-        gravity: (p,) parameters of the static model [N m].
+        gravity: (p,) parameters of the static gravity model, see `joint_gravity_torque` [N m].
         acceleration: (n,) accelerations of the independent coordinates [rad/s^2] or [m/s^2].
-        rate_noise: (n,) standard deviations of their rates [rad/s] or [m/s].
+        rate_noise: (n,) noise standard deviations of the rates of the independent coordinates
+            [rad/s] or [m/s].
         angle: (m,) work array.
         table: (m, m) work array.
         work: (n,) work array.
@@ -99,9 +100,9 @@ _ARM_DTYPE = np.dtype(
 
 
 def arm_record(arm: ArmBalance) -> np.ndarray:
-    """Pack an ArmBalance into a record (1,) of sizes and array addresses, which is fast to pass.
+    """Pack an ArmBalance into a record (1,) of sizes and array addresses, which is fast to pass to compiled code.
 
-    The arrays must outlive it. `read_arm_record` unpacks it.
+    The arrays must outlive the record. `read_arm_record` unpacks it.
     """
     mech, motion = arm.model.mech, arm.space.motion
     parts = {"mech": mech, "model": arm.model, "motion": motion, "space": arm.space, "arm": arm}
@@ -193,13 +194,13 @@ def compute_dynamic_external_forces(arm, external_force):
 def compute_static_external_forces(arm, external_force):
     """Compute external forces on an arm by the static model, which includes only gravity.
 
-    `tau = Y(q) P - sum r_i F_i` with gravity torques Y(q) P, and moment arms r_i and forces F_i of the
-    drives.
+    `tau = Y(q) P - sum r_i F_i` with gravity torques Y(q) P, and moment arms r_i and forces F_i of
+    the drives.
 
     Args:
         arm: ArmBalance; z and gravity are read.
-        external_force: (n,) written: external forces on the independent coordinates [N m]; without gravity
-            for joints that do not belong to the arm.
+        external_force: (n,) written: external forces on the independent coordinates [N m] or [N].
+            Gravity torques are included for the joints of the arm only.
 
     Returns:
         Nothing.
@@ -240,10 +241,10 @@ def motion_probability(velocity, variance):
 
 @compile_without_allocation
 def _subtract_drive_forces(arm, with_friction, external_force):
-    """Subtract the forces of the hydraulic drives from the external forces (n,), through their moment arms.
+    """Subtract the forces of the hydraulic drives, times their moment arms, from the external forces (n,).
 
-    With `with_friction`, the force of a drive is first reduced by its friction times the probability that
-    it moves.
+    With `with_friction`, the force of a drive is first reduced by its friction times the
+    probability that it moves.
     """
     model, sp, n = arm.model, arm.space, len(external_force)
     for i in range(model.hydraulic):
@@ -330,7 +331,11 @@ def solve_tip_force(arm, external_force, out):
 def _solve_by_elimination(table, right, m, min_pivot):
     """Solve m linear equations `table x = right` in place by Gaussian elimination with pivoting.
 
-    The solution overwrites `right`. Returns False if a pivot is not above `min_pivot`.
+    The solution overwrites `right`; `table` is overwritten as well.
+
+    Returns:
+        True; False if the absolute value of a pivot is not above `min_pivot`, so that there is no
+        solution.
     """
     for i in range(m):
         best = i
@@ -372,7 +377,7 @@ def gravity_parameter_count(joints: int) -> int:
 
 
 def independent_axes(machine: Machine, context: str) -> tuple[str, ...]:
-    """Return the axes that drive the independent coordinates, after checks for estimating the tip force.
+    """Return the axes that drive the independent coordinates, and check that the tip force can be estimated.
 
     Args:
         machine: the machine.

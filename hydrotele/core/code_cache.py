@@ -42,18 +42,18 @@ def _warn_once(kind: str, text: str) -> None:
 
 
 def cache_file_stem(function) -> str:
-    """Return the beginning of the names of a function's cache files: its name and line number."""
+    """Return the start of the names of a function's cache files: `<function name>-<first line number>`."""
     return f"{function.__name__}-{function.__code__.co_firstlineno}"
 
 
 class CodeCache(NullCache):
-    """Cache of a function with a lock, so that only one process compiles a missing signature.
+    """Disk cache of the compiled code of one function; a lock ensures that only one process compiles it.
 
     Args:
         function: the Python function.
-        folder: folder of the cache of its module; None if no folder is usable.
-        form: kind of compiled code, since a function may be compiled for calls from Python, from compiled
-            functions and from C.
+        folder: cache folder of the function's module; None if no folder is usable.
+        form: kind of compiled code, since a function may be compiled for calls from Python, from
+            compiled functions and from C.
     """
 
     def __init__(self, function, folder: Path | None, form: str) -> None:
@@ -62,14 +62,15 @@ class CodeCache(NullCache):
 
     @property
     def cache_path(self) -> str | None:
-        """Folder of the cache."""
+        """Folder of the cache as text; None if no folder is usable."""
         return self._folder and str(self._folder)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the stored compiled code for a signature, or None if this process has to compile it.
 
-        In the latter case this process holds the function's lock until `save_overload`. If another
-        process is compiling the function, its result is awaited.
+        Before None is returned, this process locks the function; `save_overload` releases the lock.
+        While another process holds the lock, this call waits for its compiled code, for 300 s at
+        most. Without a cache folder the result is None at once, without a lock.
         """
         if self._folder is None:
             return None
@@ -83,7 +84,11 @@ class CodeCache(NullCache):
         return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:
-        """Store compiled code, if possible, and release the lock."""
+        """Write the compiled code of a signature to a cache file, if possible, and release the function's lock.
+
+        Code with lifted loops or dynamic globals is not written. Without a usable folder, or if
+        writing fails, a warning is logged once per process and the code stays in memory only.
+        """
         try:
             if self._folder is None:
                 reason = "no cache folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
@@ -109,10 +114,11 @@ class CodeCache(NullCache):
         return CompileResult._rebuild(target_context, *code)
 
     def _code_key(self, sig: Any, codegen: Any) -> tuple:
-        """Return a tuple of all that determines the compiled code of a signature.
+        """Return a tuple of all that determines the compiled code of a signature, as the key of its cache file.
 
-        It contains form, versions, signature, processor, name, bytecode and closure, but not the sources of
-        called functions; these determine the cache folder.
+        The tuple contains the form of the code, versions of Python, numba, llvmlite and NumPy,
+        signature, processor, qualified name, and hashes of bytecode and closure. It does not
+        contain the sources of called functions; these determine the cache folder.
         """
         closure = [cell.cell_contents for cell in self._function.__closure__ or ()]
         parts = self._function.__code__.co_code, dumps(closure) if closure else b""
@@ -131,7 +137,10 @@ class CodeCache(NullCache):
 
 
 def _read_verified(path: Path) -> bytes | None:
-    """Return the content of a cache file after its checksum; None if it is missing or damaged."""
+    """Return the content of a cache file after its SHA-256 checksum; None if the file is missing or damaged.
+
+    A file is damaged if it cannot be read or its checksum is wrong; a warning is then logged.
+    """
     size = hashlib.sha256().digest_size
     try:
         stored = path.read_bytes()
@@ -147,7 +156,7 @@ def _read_verified(path: Path) -> bytes | None:
 
 
 def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under a temporary name and rename it."""
+    """Write bytes to a file atomically: write a temporary file in the same folder, then rename it."""
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
         part.write_bytes(content)
@@ -158,9 +167,10 @@ def _write_atomically(path: Path, content: bytes) -> None:
 
 
 def _acquire_lock(folder: Path, function) -> int | None:
-    """Lock a function against other processes and return the file handle.
+    """Lock a function's cache against other processes; return the handle of the open lock file.
 
-    Returns None after a timeout, and if the file system allows no lock.
+    While another process holds the lock, the call waits, and after 1 s shows a status line on
+    stderr. Returns None after 300 s of waiting, and if the lock file cannot be opened or locked.
     """
     try:
         handle = os.open(folder / f"{cache_file_stem(function)}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)

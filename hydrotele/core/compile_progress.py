@@ -50,7 +50,10 @@ class ProgressLine:
         self._print_time, self._width = 0.0, 0
 
     def show(self, text: str) -> None:
-        """Show a text: redraw the line in a terminal; elsewhere print it at most every two seconds."""
+        """Show a text on stderr: redraw the line in a terminal; elsewhere print a line at most every 2 s.
+
+        Nothing is shown if the level of the logger `hydrotele` is above WARNING.
+        """
         if not _LOG.isEnabledFor(logging.WARNING):
             return
         if sys.stderr.isatty():
@@ -62,7 +65,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def clear(self) -> None:
-        """Erase the line from the terminal."""
+        """Erase the line if it was drawn in a terminal; printed lines stay."""
         if self._width:
             sys.stderr.write("\r" + " " * self._width + "\r")
             sys.stderr.flush()
@@ -70,7 +73,9 @@ class ProgressLine:
 
 
 class CompileProgress(event.Listener):
-    """Listener for numba's compile events that draws the progress bar from a background thread.
+    """Listener for numba's compile events that draws a progress bar on stderr from a background thread.
+
+    Python's garbage collection is disabled while numba compiles.
 
     Args:
         is_cached: predicate that returns whether a function has code in the cache.
@@ -87,7 +92,11 @@ class CompileProgress(event.Listener):
         self._thread: threading.Thread | None = None
 
     def on_start(self, event: event.Event) -> None:
-        """Record that the compilation of a function has started."""
+        """Record that numba has started to compile a function, possibly as a callee of another function.
+
+        For the outermost function, disable garbage collection and estimate the total work. The
+        first call also starts the thread that draws the bar.
+        """
         dispatcher = (event.data or {})["dispatcher"]
         if not self._names:
             # The compiler creates millions of objects that all live until it ends.
@@ -102,7 +111,10 @@ class CompileProgress(event.Listener):
         self._names.append(dispatcher.py_func.__name__.strip("_"))
 
     def on_end(self, event: event.Event) -> None:
-        """Record that the compilation of a function has ended."""
+        """Record that numba has compiled a function, and count its estimated work as completed.
+
+        After the outermost function, garbage collection is restored and the bar is erased.
+        """
         function = (event.data or {})["dispatcher"].py_func
         self._names.pop()
         weight = self._pending.pop(function, 0)
@@ -130,7 +142,10 @@ class CompileProgress(event.Listener):
         return found
 
     def _redraw_periodically(self) -> None:
-        """Update the progress bar periodically; runs in the background thread."""
+        """Redraw the progress bar every 0.2 s in an endless loop; runs in the background thread.
+
+        The bar is drawn only while a function is compiled, once 1 s in total was spent compiling.
+        """
         while True:
             time.sleep(_REDRAW_INTERVAL)
             names = self._names[:1] + self._names[-1:]
@@ -147,7 +162,11 @@ class CompileProgress(event.Listener):
 
 
 def called_dispatchers(function: FunctionType) -> list[Any]:
-    """Return the compiled functions that a function refers to, by name or as module attribute."""
+    """Return numba's dispatchers (the compiled functions) that a Python function refers to.
+
+    They are found among its global names and closure variables, and as attributes of modules that
+    it refers to.
+    """
     names = function.__code__.co_names
     scope = function.__globals__ | {
         name: cell.cell_contents

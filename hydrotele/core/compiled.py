@@ -67,11 +67,18 @@ def compile_inlined(function):
 
 
 def _make_dispatcher(function, **options: Any):
-    """Create numba's dispatchers of a function: one for calls from Python, one for compiled callers.
+    """Create numba's dispatcher of a function for calls from Python, with a second one for compiled callers.
 
-    A dispatcher compiles the function for each combination of argument types. The second one has no
-    wrapper that converts Python objects. The wrapper takes a fifth of the compile time, and most
-    functions are never called from Python.
+    A dispatcher compiles the function for each combination of argument types. The second one is
+    attached to the first. It has no wrapper that converts Python objects. The wrapper takes a fifth
+    of the compile time, and most functions are never called from Python.
+
+    Args:
+        function: the Python function.
+        options: options of `numba.njit`, in addition to those of all functions.
+
+    Returns:
+        The dispatcher for calls from Python.
     """
     options |= {
         "error_model": "numpy", "nogil": True,
@@ -90,7 +97,7 @@ def _make_dispatcher(function, **options: Any):
 
 
 def callback(signature):
-    """Return a decorator that turns a function into a `Callback` for C code."""
+    """Return a decorator that turns a function into a `Callback` with this numba signature, for calls from C."""
     return lambda function: Callback(function, signature)
 
 
@@ -118,17 +125,20 @@ class Callback:
 
     @property
     def address(self) -> int:
-        """Address of the compiled function."""
+        """Address of the compiled function in memory, an integer; the first access compiles the function."""
         return self._compiled.address
 
     @property
     def ctypes(self) -> Any:
-        """The compiled function as a ctypes function."""
+        """The compiled function as a ctypes function; the first access compiles it."""
         return self._compiled.ctypes
 
 
 def compile_in_background(function, code: str) -> None:
     """Start to compile a function in a background process, unless it is cached already.
+
+    Nothing is started without a cache folder, or if this program has started a process with the
+    same code before. The process is killed when this program exits.
 
     Args:
         function: module-level function to compile, or its `compiled` form.
@@ -169,10 +179,11 @@ def _function_cache(function, form: str) -> NullCache:
 
 
 def cache_folder() -> Path | None:
-    """Return the folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/compiled`.
+    """Create, if needed, and return the folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/compiled`.
 
-    The folder is created with access for its owner only. Returns None if there is no home folder,
-    if the folder cannot be created or written, or if another user owns it or can write to it.
+    `$XDG_CACHE_HOME` is `~/.cache` by default. The folder is created with access for its owner
+    only. Returns None if there is no home folder, if the folder cannot be created or written, or if
+    another user owns it or can write to it.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     if not os.path.isabs(home):
@@ -215,7 +226,7 @@ def _read_source(module: str) -> bytes | None:
 
 @functools.cache
 def _find_imports(module: str) -> frozenset[str]:
-    """Return the modules of this package that a module imports directly."""
+    """Return the names of the modules of this package that the source text of a module imports directly."""
     found = set()
     for place, names in _IMPORT_PATTERN.findall(_read_source(module) or b""):
         package = place.decode()
@@ -228,10 +239,11 @@ def _find_imports(module: str) -> frozenset[str]:
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """Return a hash of the sources of a module, of its direct and indirect imports and of this module.
+    """Return a hash of the sources of a module, of its direct and indirect imports and of `core.compiled`.
 
-    The hash is a part of the name of the cache folder, so that a changed source selects another folder.
-    This module is always included, because it determines how all functions are compiled.
+    Only modules of this package count. The hash is a part of the name of the cache folder, so that
+    a changed source selects another folder. `core.compiled` and its imports are always included,
+    because they determine how all functions are compiled.
     """
     open_ones = [module, __name__]
     reached = set(open_ones)
@@ -247,9 +259,11 @@ def source_digest(module: str) -> str:
 
 @functools.cache
 def _module_cache_folder(module: str) -> Path | None:
-    """Return a module's cache folder, mark it as used and delete unused folders of the module.
+    """Create, if needed, and return the cache folder of a module for its present source; mark it as used.
 
-    Returns None for modules of other packages, and if the folder cannot be created.
+    The modification time of a folder is the time of its last use. When a folder is created, folders
+    for other sources of the module that were unused for 30 days are deleted. Returns None for
+    modules of other packages, and if there is no usable folder.
     """
     if _CACHE_FOLDER is None or _read_source(module) is None:
         return None
@@ -267,7 +281,7 @@ def _module_cache_folder(module: str) -> Path | None:
 
 
 def _is_cached(function) -> bool:
-    """Return whether the cache contains any code of a function of this package."""
+    """Return whether the cache contains code of a function of this package, for any argument types."""
     folder = _module_cache_folder(function.__module__)
     return folder is not None and any(folder.glob(f"{cache_file_stem(function)}.*.code"))
 

@@ -48,7 +48,10 @@ def scale_numbers(value: Any, factor: float) -> Any:
 
 
 def split_unit(key: str) -> tuple[str, float | None]:
-    """Split a key into its name without unit suffix and the factor to SI; None without suffix.
+    """Split a key into its name without unit suffix and the factor that converts its values to SI.
+
+    Without a unit suffix, the name is the whole key and the factor is None. The suffix `_hz` of an
+    angular frequency, such as `bandwidth_hz`, has the factor 2 pi.
 
     >>> split_unit("accuracy_mm")
     ('accuracy', 0.001)
@@ -105,7 +108,13 @@ class StrictModel(pydantic.BaseModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _convert_units_and_refuse_unknown_keys(cls, data):
-        """Convert keys with a unit suffix to SI; raise ValueError for unknown or repeated keys."""
+        """Convert the values of keys with a unit suffix to SI, and rename these keys to the field names.
+
+        Data other than a dict are returned unchanged.
+
+        Raises:
+            ValueError: a key is unknown, or a field is given twice.
+        """
         if not isinstance(data, dict):
             return data
         fields = cls.model_fields
@@ -199,9 +208,10 @@ def _check_size(text: str) -> None:
 
 
 def _key_lines(root) -> dict[tuple, int]:
-    """Return key path -> line number from 1 of every key below a YAML node.
+    """Return {key path: line number from 1} of every key and list item below a YAML node.
 
-    The keys of a node that aliases repeat are recorded at its first place only.
+    A key path is a tuple of keys and list indices; the node itself has the path (). The keys of a
+    node that aliases repeat are recorded at its first occurrence only.
     """
     lines: dict[tuple, int] = {(): root.start_mark.line + 1}
     opened: set = set()
@@ -232,7 +242,7 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
         path: the file.
 
     Returns:
-        (data, key path -> line number from 1).
+        (data, {key path: line number from 1}); a key path is a tuple of keys and list indices.
 
     Raises:
         InputError: the file is missing, not YAML, or not a mapping.
@@ -272,13 +282,14 @@ def validate_data(model: type[Model], data: dict, source: str, lines: dict[tuple
         model: the class.
         data: the data, as returned by `read_yaml`.
         source: file name for error messages.
-        lines: key path -> line, as returned by `read_yaml`; may be empty.
+        lines: {key path: line}, as returned by `read_yaml`; may be empty.
 
     Returns:
         The validated instance.
 
     Raises:
-        InputError: the data are not valid; names file, line, key path and allowed values.
+        InputError: the data are not valid. The message names the file, the line of the first
+            problem, and the key path and reason of up to five problems.
     """
     try:
         return model.model_validate(data)

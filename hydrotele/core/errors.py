@@ -22,7 +22,10 @@ class InputError(ValueError):
 
 
 def _shorten_text(text: str, max_bytes: int) -> str:
-    """Shorten a text to `max_bytes` bytes by cutting its middle, and escape control characters."""
+    """Escape the control characters of a text, except line breaks, and shorten it by cutting its middle.
+
+    The result has at most `max_bytes` bytes of UTF-8.
+    """
     if len(text) > 2 * max_bytes:
         text = f"{text[:max_bytes]} ... {text[-max_bytes:]}"
     text = "".join(c if c.isprintable() or c == "\n" else _escape_character(c) for c in text)

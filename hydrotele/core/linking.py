@@ -23,6 +23,7 @@ class Callee:
 
     Attributes:
         dispatcher: numba's dispatcher that compiles it.
+        location: module, qualified name and first line number of the function.
         is_separate: whether callers link to its symbol instead of copying its code.
     """
 
@@ -47,12 +48,21 @@ class Callee:
         return self.dispatcher.overloads[args]
 
     def call_template(self, args: tuple, keywords: dict) -> tuple:
-        """Compile the function for a call and return numba's template of it, which states its types.
+        """Compile the function for the argument types of a call, and describe its types to numba.
 
-        It replaces `Dispatcher.get_call_template` of numba.
+        It replaces `Dispatcher.get_call_template` of numba. A literal argument gets its non-literal
+        type, so that a function is not compiled for each constant.
 
-        A literal argument gets its non-literal type, so that a function is not compiled for each
-        constant.
+        Args:
+            args: numba types of the positional arguments.
+            keywords: numba types of the keyword arguments.
+
+        Returns:
+            (numba's call template with the compiled signature, Python signature, argument types,
+            {}).
+
+        Raises:
+            TypingError: the result of the function is or contains a `Reference`.
         """
         pysig, args = self.dispatcher.fold_argument_types(args, keywords)
         args = tuple(map(argument_type, args))
@@ -72,7 +82,14 @@ class Callee:
         return self._symbol_key(result)
 
     def _symbol_key(self, result: Any) -> tuple[str, str]:
-        """Make a compiled function's symbol known to numba's code generator, and return the key of the symbol."""
+        """Make a compiled function's symbol known to numba's code generator, and return the key of the symbol.
+
+        Args:
+            result: numba's `CompileResult` of the function.
+
+        Returns:
+            ("symbol", name of the symbol).
+        """
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)
@@ -105,7 +122,8 @@ def load_callees(needed: dict[str, tuple[tuple, tuple]]) -> bool:
         needed: result of `external_callees` when the code was stored.
 
     Returns:
-        False if the symbol of a function has changed, so that the cached code cannot be used.
+        False if the symbol of a function has changed, so that the cached code cannot be used; else
+        True.
     """
     for symbol, (place, args) in needed.items():
         importlib.import_module(place[0])

@@ -53,13 +53,13 @@ _MUJOCO_PHRASES = (
 
 @dataclass(frozen=True)
 class MjcfDocument:
-    """An MJCF or URDF that depends on no file that was not checked.
+    """An MJCF or URDF of which all files that it names have been found and checked.
 
     Attributes:
         path: file that was read.
         root: root element, without `include`; asset files have absolute paths.
-        models: name -> document of every `model` asset, the nested ones first; the names are those
-            of the `file` attributes.
+        models: generated name -> document of every nested model (`model` asset), the innermost ones
+            first; the `file` attributes of these assets contain the generated names.
         origins: element -> file and line of its start tag.
         is_verbatim: whether the file names no other file, so that its own text is complete.
     """
@@ -72,7 +72,7 @@ class MjcfDocument:
 
     @property
     def text(self) -> str:
-        """Return the XML text, with one start tag per line; `model` assets are not part of it."""
+        """XML text, with one start tag per line; nested models (`model` assets) are not part of it."""
         ElementTree.indent(self.root)
         return ElementTree.tostring(self.root, encoding="unicode")
 
@@ -216,7 +216,17 @@ def copy_mjcf(mjcf: Path, target: Path, folder: str) -> None:
 
 
 def _copy_assets(root: Element, copies: dict[str, str], folder: Path, prefix: str) -> None:
-    """Copy the files of a resolved document to a folder and rename them in the document."""
+    """Copy the files that a resolved document names to a folder, and make the document name the copies.
+
+    Assets without a name also get one: the stem of their original file, which is MuJoCo's default.
+
+    Args:
+        root: root element of the document, changed in place.
+        copies: {source path, or generated name of a nested model: file name of its copy}; files in
+            it are not copied again, and new copies are added to it.
+        folder: folder of the copies.
+        prefix: text before the file names in the document, such as `assets/`.
+    """
     for element, attribute in _file_references(root):
         source = str(element.get(attribute))
         if source not in copies:
@@ -248,7 +258,8 @@ class _Reader:
             parents: files of the documents that it is nested in, outermost first.
 
         Returns:
-            The document, and the number of its elements, each counted as often as `replicate` copies it.
+            The document, and the number of its elements with all copies, such as those by
+            `replicate`.
         """
         root = self._parse(path)
         included = {path.resolve()}
@@ -290,7 +301,15 @@ class _Reader:
         return root
 
     def _expand_includes(self, element: Element, path: Path, main: Path, included: set[Path], depth: int) -> None:
-        """Replace the `include` elements below an element by the content of their files, in place."""
+        """Replace the `include` elements below an element by the content of their files, in place.
+
+        Args:
+            element: the element.
+            path: file that contains the element.
+            main: file of the outermost document; included files are sought in its folder first.
+            included: resolved paths of all included files and of `main`; new ones are added.
+            depth: nesting depth of the element.
+        """
         check_limit(self._format_location(element), "FILE_DEPTH", depth)
         for child in list(element):
             if child.tag != "include":
@@ -318,7 +337,11 @@ class _Reader:
             element[index : index + 1] = list(content)
 
     def _extract_asset_folders(self, root: Element) -> dict[str, str]:
-        """Return the asset folders of the compiler elements, and remove them from the document."""
+        """Return the `compiler` attributes that locate asset files, and remove them from the document.
+
+        The keys of the result are `meshdir`, `texturedir` and `strippath`. The attribute `assetdir`
+        sets the first two.
+        """
         folders: dict[str, str] = {}
         for compiler in root.iter("compiler"):
             for key in ("assetdir", "meshdir", "texturedir", "strippath"):
@@ -327,7 +350,21 @@ class _Reader:
         return folders
 
     def _resolve_asset(self, element: Element, attribute: str, path: Path, folders: Mapping[str, str]) -> Path:
-        """Return the absolute path of an asset; it is a regular file."""
+        """Return the absolute path of an asset file.
+
+        The file is sought in the asset folder of its kind, relative to the folder of the document.
+        If it is missing there, it is sought relative to the folder of the file that contains the
+        element.
+
+        Args:
+            element: the asset.
+            attribute: attribute of the asset that names the file.
+            path: file of the document.
+            folders: result of `_extract_asset_folders`.
+
+        Raises:
+            InputError: there is no such file, or it is not a readable regular file.
+        """
         folder = folders.get("texturedir" if element.tag == "texture" else "meshdir", "")
         named = _portable_path(element.attrib[attribute])
         if folders.get("strippath") == "true":
@@ -368,7 +405,7 @@ class _Reader:
         return self.models[key]
 
     def _resolve_urdf_meshes(self, root: Element, path: Path) -> None:
-        """Make the mesh paths of a URDF absolute, and check the total size of the existing files.
+        """Make the mesh paths of a URDF absolute in place, and check the total size of the existing files.
 
         Missing files are accepted here, since those of visual meshes may be missing.
         """
@@ -401,7 +438,16 @@ def _portable_path(name: str) -> PurePosixPath:
 
 
 def _find_file(name: PurePosixPath, first: Path, second: Path) -> Path:
-    """Return the path of a file in the first of two folders that has it, otherwise in the first one."""
+    """Return the path of a file in the first of two folders that contains it; if none does, in `first`.
+
+    Args:
+        name: file name or path relative to the folders.
+        first: folder that is tried first.
+        second: folder that is tried next.
+
+    Raises:
+        InputError: no file can have this name.
+    """
     try:
         return next((folder / name for folder in (first, second) if (folder / name).exists()), first / name)
     except (OSError, ValueError) as error:  # a name that no file can have

@@ -124,7 +124,10 @@ def check_output_folder(target: str | Path, kind: str) -> None:
 
 
 def _is_match(name: str, pattern: str) -> bool:
-    """Return whether a relative path matches a pattern such as `runs/*/*`, or may be a parent folder of it."""
+    """Return whether a relative path matches a pattern such as `runs/*/*`, or its first components.
+
+    The second case accepts parent folders of matching files.
+    """
     parts, wanted = name.split("/"), pattern.split("/")
     return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 

@@ -8,10 +8,10 @@ of related effects. The library imports the module automatically. The module def
 
 1. the fixed name, a one-sentence description, and the law of the model that the effect changes;
 2. `locations(machine)`: the possible locations, empty if the machine has no such part;
-3. `parameters(machine, location)`: for each parameter its unit, its value in the given machine, its
-   bounds and scale relative to the machine, and the reason for its smallest relevant deviation;
-4. `apply(machine, location, values)`: the changed machine, made with `with_value`. With nominal values
-   it must behave like the given machine.
+3. `parameters(machine, location)`: for each parameter its unit, its value in the given machine, and
+   its bounds, prior standard deviation and smallest relevant change, with reasons in the docstring;
+4. `apply(machine, location, values)`: the changed machine, made with `with_value`. With nominal
+   values it must behave like the given machine.
 
 An effect that only changes fields of `Machine` is simulated, estimated, saved and loaded without
 further code. Any other effect needs a law and a term that uses it (`hydrotele.terms`). A module
@@ -53,9 +53,11 @@ _loaded_effects: dict[str, tuple[str, ...]] = {}  # digest of a file's text -> n
 
 
 def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
-    """Run an effect file and add its effects to a library.
+    """Run a Python file that defines effects, and add these effects to a library.
 
-    A file with the same content as one that was read before is not run again.
+    A file with the same content as one that was read before is not run again. The file is also
+    added to the environment variable `HYDROTELE_EFFECTS`, from which child processes load their
+    effects.
 
     Args:
         path: the file.
@@ -65,7 +67,8 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
         Names of the effects that the file defines.
 
     Raises:
-        InputError: the file cannot be read or run, defines nothing, or uses an existing name.
+        InputError: the file cannot be read or run, defines neither effects nor laws, or uses an
+            existing name.
     """
     digest = hashlib.sha256(read_bytes(path)).hexdigest()
     if path.suffix != ".py":
@@ -141,9 +144,10 @@ def _describe_exception(error: BaseException) -> str:
 
 
 def _collect_effects(content: Any) -> tuple[Any, ...]:
-    """Return the effects that a module defines as `EFFECT` or `EFFECTS`.
+    """Return the effects that a module defines as `EFFECT` or `EFFECTS`; an empty tuple if it has neither.
 
-    The content may also be an effect or a collection of effects, as entry points provide them.
+    `content` is the module. It may also be an effect or a collection of effects, as entry points
+    provide them.
     """
     if isinstance(content, ModuleType):
         content = getattr(content, "EFFECT", None) or getattr(content, "EFFECTS", ())
@@ -167,7 +171,7 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
 
 
 def _pass_file_to_child_processes(path: Path) -> None:
-    """Add an effect file to the environment variable from which child processes load their effects."""
+    """Add an effect file to `HYDROTELE_EFFECTS`, the environment variable from which child processes load effects."""
     known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
     if str(resolve_path(path)) not in known:
         paths = [*filter(None, known), str(resolve_path(path))]
@@ -196,9 +200,9 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
 
 
 def add_effects_from_environment_variable(library: dict[str, Effect]) -> None:
-    """Add the custom effects that the parent process loaded to a library, updated in place.
+    """Run the effect files that `HYDROTELE_EFFECTS` lists, and add their effects to a library.
 
-    The environment variable `HYDROTELE_EFFECTS` lists the files, which are run again.
+    A parent process lists its files in this environment variable. `library` is updated in place.
     """
     for path in filter(None, os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)):
         add_effects_from_file(Path(path), library)
@@ -232,7 +236,7 @@ EFFECTS: dict[str, Effect] = _discover_effects()
 
 
 def load_effects(path: str | Path) -> tuple[str, ...]:
-    """Run a Python file that defines effects and laws, and add them to the library.
+    """Run a Python file that defines effects and laws, and add them to the library `EFFECTS`.
 
     Child processes load the file as well. The file runs with all rights of the user, so load only
     files that you trust. hydrotele runs no Python file that the user did not name.
@@ -244,7 +248,8 @@ def load_effects(path: str | Path) -> tuple[str, ...]:
         Names of the effects that the file defines.
 
     Raises:
-        InputError: the file cannot be read or run, defines nothing, or uses an existing name.
+        InputError: the file cannot be read or run, defines neither effects nor laws, or uses an
+            existing name.
     """
     return add_effects_from_file(Path(path), EFFECTS)
 
@@ -255,15 +260,15 @@ def apply_effect(machine: Machine, name: str, location: str, values: Mapping[str
     Args:
         machine: the machine without the effect.
         name: name of the effect.
-        location: location of the effect; may be empty if there is only one.
+        location: location of the effect; may be empty if the machine has only one location for it.
         values: parameter name -> value in the effect's unit; optional ones may be omitted.
 
     Returns:
         The changed machine.
 
     Raises:
-        InputError: unknown effect, location or parameter, or a value out of range; the message
-            lists valid values.
+        InputError: the effect, location or a parameter is unknown, a required parameter is missing,
+            or a value is out of bounds; the message lists valid values.
     """
     if name not in EFFECTS:
         own = "for a custom effect, name the file that defines it: --effects FILE.py"

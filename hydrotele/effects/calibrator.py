@@ -29,10 +29,11 @@ def _with_sensor_error(machine: Machine, joint: str, **numbers: float) -> Machin
 
 
 def _bending_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of a link's bending compliance, the bending angle per torque.
+    """Return nominal value, bounds and prior of `compliance`, the bending angle of a link per torque.
 
-    The torque acts perpendicular to the axis of the link's joint. For comparison, one degree of bending
-    by 200 N m, the weight torque of an extended calibrator, is 9e-5 rad/(N m).
+    The torque acts perpendicular to the axis of the link's joint. The smallest relevant change is
+    2e-6 rad/(N m). For comparison, one degree of bending by 200 N m, the weight torque of an
+    extended calibrator, is 9e-5 rad/(N m).
     """
     present = machine.joints[joint].bending
     high = max(5.0e-4, present)

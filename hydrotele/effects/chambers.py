@@ -56,8 +56,9 @@ def _set_tank_leakage(machine: Machine, location: str, values: Values) -> Machin
 def _hose_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the volume that a hose gains per pressure.
 
-    Bounds and prior are proportional to the compliance of the oil (volume over bulk modulus) at
-    mid-stroke. The smallest relevant change is 5 % of it, the scatter of a hose's rating.
+    Bounds and prior are proportional to the compliance of the oil (volume over bulk modulus) in the
+    head chamber at mid-stroke. The smallest relevant change is 5 % of that compliance, the scatter
+    of a hose's rating.
     """
     drive, cylinder = machine.axes[location].hydraulic_drive, machine.axes[location].cylinder
     assert machine.supply
@@ -84,7 +85,7 @@ def _oil_effect_locations(machine: Machine) -> tuple[str, ...]:
 def _bulk_modulus_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the bulk modulus of the oil.
 
-    Entrained air reduces it by tens of per cent. The smallest relevant change is 5 %.
+    Entrained air reduces the bulk modulus by tens of per cent. The smallest relevant change is 5 %.
     """
     assert machine.supply
     present = machine.supply.bulk_modulus
@@ -142,10 +143,11 @@ NAME = "orifice_leakage"
 
 
 def _sqrt_relief_pressure(machine: Machine) -> float:
-    """Return the square root of the relief pressure [sqrt(Pa)].
+    """Return the square root of the supply's relief pressure [sqrt(Pa)].
 
-    Turbulent leakage is gain times root of pressure difference. With this root, the gain is converted to
-    and from the effect's parameter, the flow at relief pressure.
+    The turbulent leakage flow is a gain times the square root of the pressure difference. The
+    parameter of the effect is the flow at relief pressure, which is the gain times the returned
+    value.
     """
     assert machine.supply
     return math.sqrt(machine.supply.relief_pressure)
@@ -154,7 +156,9 @@ def _sqrt_relief_pressure(machine: Machine) -> float:
 def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the turbulent leakage flow at the relief pressure.
 
-    Bounds and prior are the same fractions of the valve's rated flow as for laminar leakage.
+    The upper bound is 50 % of the valve's rated flow above the nominal value, the prior standard
+    deviation 5 % of the rated flow, and the smallest relevant change 0.5 %. These are the fractions
+    used for laminar leakage.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -165,7 +169,10 @@ def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Pa
 
 
 def _set_orifice_leakage(machine: Machine, location: str, values: Values) -> Machine:
-    """Return the machine with turbulent leakage between the head and the rod chamber of a drive."""
+    """Return the machine with turbulent leakage between the head and the rod chamber of a drive.
+
+    A `flow` of 0 removes the leakage.
+    """
     valve, gain = machine.axes[location].valve, values["flow"] / _sqrt_relief_pressure(machine)
     assert valve
     numbers = {"smoothing": valve.smoothing}

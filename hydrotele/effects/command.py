@@ -24,10 +24,10 @@ def _nominal_delay(machine: Machine, location: str) -> float:
 
 
 def _delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the command delay.
+    """Return nominal value, bounds and prior of the command delay of an axis, or of all axes (location `all`).
 
-    A fieldbus delays by milliseconds, pilot hydraulics by a tenth of a second. The smallest relevant
-    change is 3 ms, one bus cycle.
+    A fieldbus delays by milliseconds, pilot hydraulics by a tenth of a second. The smallest
+    relevant change is 3 ms, one bus cycle.
     """
     present = _nominal_delay(machine, location)
     high = max(0.5, present)

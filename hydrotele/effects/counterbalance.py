@@ -25,11 +25,11 @@ def _max_inlet_drop(machine: Machine, location: str) -> float:
 
 
 def _compensator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the effect of a pressure compensator.
+    """Return nominal value, bounds and prior of `regulation`, which describes a pressure compensator.
 
-    The parameter is the fraction of the relief pressure that the compensator absorbs; 0 means no
-    compensator. Usual are 0.9 to 0.98 (estimate). The smallest relevant fraction is 0.1, which has an
-    effect only at low load and full supply pressure.
+    It is 1 minus the largest pressure drop across the inlet edge of the spool over the relief
+    pressure; 0 means no compensator. Usual are 0.9 to 0.98 (estimate). The smallest relevant change
+    is 0.1, which has an effect only at low load and full supply pressure.
     """
     assert machine.supply
     present = 1.0 - _max_inlet_drop(machine, location) / machine.supply.relief_pressure
@@ -40,8 +40,10 @@ def _compensator_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _set_pressure_compensator(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with a pressure compensator in a valve.
 
-    The drop across the inlet edge is limited to (1 - `regulation`) times the relief pressure. The inlet
-    edges are enlarged so that the flow at a drop of half the relief pressure does not change.
+    The pressure drop across the inlet edge is limited to (1 - `regulation`) times the relief
+    pressure. The gains of the inlet edges are changed so that the flow does not change if half the
+    relief pressure is available as pressure drop. With the present `regulation`, the machine is
+    returned unchanged.
     """
     valve, supply = machine.axes[location].valve, machine.supply
     assert valve and supply
@@ -78,8 +80,9 @@ def _installed_valve(machine: Machine, location: str) -> Counterbalance | None:
 def _counterbalance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of a counterbalance valve's setting; 0 means no valve.
 
-    The setting is the pressure of the chamber at which the valve opens without pilot pressure. Usually
-    it is 1.3 times the load pressure. Bounds and prior are fractions of the supply's relief pressure.
+    The setting is the pressure of the chamber at which the valve opens without pilot pressure.
+    Usually it is 1.3 times the load pressure. Bounds and prior are fractions of the supply's relief
+    pressure; the smallest relevant change is 7 % of it.
     """
     assert machine.supply
     relief = machine.supply.relief_pressure

@@ -98,7 +98,7 @@ def valve_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def hydraulic_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes with pressure chambers, driven by a valve or an own pump."""
+    """Return the names of the axes whose drive has pressure chambers, fed through a valve or by the axis' own pump."""
     return tuple(machine.hydraulic_axes)
 
 
@@ -111,16 +111,18 @@ def nonparallel_cylinder_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the cylinder axes whose length depends on the positions of the pins.
 
     These are all cylinder axes except those whose cylinder is parallel to the sliding joint that it
-    drives. There, the length equals the position, and lateral pin offsets have no effect.
+    drives. The length of such a cylinder is the joint position plus a constant, and lateral pin
+    offsets have no effect.
     """
     return tuple(name for name in cylinder_axes(machine) if not _is_parallel_to_slide(machine, name))
 
 
 def lateral_directions(machine: Machine, axis: str) -> str:
-    """Return the two coordinates perpendicular to the joint of an axis, such as "xz".
+    """Return the two coordinates other than the one closest to the joint axis of a hinge, such as "xz" for y.
 
-    Offsets of a cylinder's pin in these directions change the ratio between cylinder length and
-    joint position. A sliding joint is taken to move in the plane of x and z.
+    Offsets of a cylinder's pin in these directions change the relation between cylinder length and
+    joint position. For a sliding joint, which is taken to move in the plane of x and z, the result
+    is "xz".
     """
     joint = machine.joints[machine.axes[axis].joint]
     way = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
@@ -148,7 +150,7 @@ def hinge_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def drive_kind(machine: Machine, axis: str) -> str:
-    """Return the field that holds the drive of an axis: `cylinder`, `motor` or `force`."""
+    """Return the name of the field of `machine.axes[axis]` that holds its drive: `cylinder`, `motor` or `force`."""
     facts = machine.axes[axis]
     return "cylinder" if facts.cylinder else "motor" if facts.motor else "force"
 
@@ -184,6 +186,7 @@ def typical_speed(machine: Machine, axis: str) -> float:
     """Return the speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
 
     A force drive has no flow rating; it is assumed to travel the range of its joint in two seconds.
+    A joint without a range counts as 1 rad or 1 m.
     """
     facts = machine.axes[axis]
     if facts.is_hydraulic:
@@ -201,10 +204,10 @@ def outboard_links(machine: Machine, link: str) -> list[str]:
 
 
 def outboard_child(machine: Machine, link: str) -> str | None:
-    """Return the name of the next link outwards, None for the last link.
+    """Return the name of the next link outwards; None for the link with the arm's tip, or without children.
 
-    It is the child link that carries the arm's tip. If none does, it is the child whose joint is
-    farthest from the link's own joint.
+    It is the child link that carries the arm's tip, directly or through other links. If none does,
+    it is the child whose frame origin is farthest from that of the given link.
     """
     if machine.arm and machine.arm.tip.link != "world":
         step = machine.arm.tip.link
@@ -220,9 +223,9 @@ def outboard_child(machine: Machine, link: str) -> str | None:
 
 
 def next_joint_or_tip_position(machine: Machine, link: str) -> np.ndarray | None:
-    """Return the origin of the next link outwards (3,) [m], in the frame of the given link.
+    """Return the origin of the next link outwards (see `outboard_child`), in the frame of the given link (3,) [m].
 
-    For the link with the arm's tip it is the position of the tip; None if no link follows.
+    For the link with the arm's tip it is the position of the tip. None if no link follows.
     """
     if machine.arm and machine.arm.tip.link == link:
         return np.array(machine.arm.tip.position)
@@ -233,8 +236,8 @@ def next_joint_or_tip_position(machine: Machine, link: str) -> np.ndarray | None
 def link_size(machine: Machine, link: str) -> float:
     """Return the size of a link [m], at least 1 mm.
 
-    It is the larger of two distances from the link's joint: to the next joint (or the arm's tip), and
-    to the centre of mass.
+    It is the larger of two distances from the origin of the link's frame: to the next link's origin
+    (or the arm's tip), and to the centre of mass.
     """
     point = next_joint_or_tip_position(machine, link)
     far = 0.0 if point is None else float(np.linalg.norm(point))

@@ -29,15 +29,17 @@ from hydrotele.terms.term import Term
 def _make_friction_parameters(field: str, scale: float, high: float):
     """Return a function (machine, location) -> nominal value, bounds and prior of a friction parameter.
 
-    The smallest relevant change is the larger of two values: a thousandth of the drive's largest force
-    (error of a good pressure transducer), and a tenth of the given friction (change by warm oil).
+    The smallest relevant change is the larger of two values: a thousandth of the drive's largest
+    force (error of a good pressure transducer), and a tenth of the given friction (change by warm
+    oil).
 
     Args:
-        field: field of the machine's friction: `coulomb`, `viscous`, or `stribeck_extra`, the additional
-            friction at low speed.
-        scale: smallest standard deviation of the prior as a fraction of the drive's largest force [1]; for
-            viscous friction that force is divided by the typical speed.
-        high: largest increase as a fraction of the same force [1].
+        field: field of the machine's friction: `coulomb`, `viscous`, or `stribeck_extra`, the
+            additional friction at low speed.
+        scale: smallest standard deviation of the prior as a fraction of the drive's largest force
+            [1]; for viscous friction that force is divided by the typical speed. The standard
+            deviation is at least 30 % of the given friction.
+        high: upper bound minus nominal value, as a fraction of the same force [1].
     """
 
     def friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -65,7 +67,7 @@ def _set_friction(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _friction_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes with any friction, to which an asymmetry can be added."""
+    """Return the names of the axes whose drive has Coulomb, Stribeck or viscous friction, which may be asymmetric."""
     present = {name: machine.axes[name].drive.friction for name in machine.axes}
     return tuple(n for n, f in present.items() if f.coulomb + f.stribeck_extra + f.viscous > 0)
 
@@ -73,8 +75,9 @@ def _friction_axes(machine: Machine) -> tuple[str, ...]:
 def _asymmetry_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of the direction dependence of a drive's friction.
 
-    There is one relative asymmetry for dry and one for viscous friction, each only if the drive has such
-    friction. The friction of lip seals differs by tens of per cent between the directions.
+    The parameters are one relative asymmetry for dry and one for viscous friction, each only if the
+    drive has such friction. The friction of lip seals differs by tens of per cent between the
+    directions. The smallest relevant change is 0.02.
     """
     friction = machine.axes[location].drive.friction
     sizes = {}
@@ -111,7 +114,8 @@ LOAD_FRICTION, POSITION_FRICTION = "load_dependent_friction", "position_dependen
 def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the ratio of dry friction to the load of a drive.
 
-    The friction of seals and guides is some per cent of the load.
+    The friction of seals and guides is some per cent of the load. The smallest relevant change is
+    0.005.
     """
     present = term_parameter(machine, LOAD_FRICTION, location, "force", "coefficient", 0.0)
     return {"coefficient": Parameter("1", present, 0.0, max(0.4, present), 0.03, 0.005)}
@@ -130,7 +134,8 @@ def _set_load_friction(machine: Machine, location: str, values: Values) -> Machi
 def _position_range(machine: Machine, location: str) -> tuple[float, float]:
     """Return lowest and highest position of a drive [m] or [rad].
 
-    For an unlimited joint they are one revolution or 1 m apart.
+    For a cylinder they are 0 and the stroke, otherwise the joint's range. For a joint without a
+    range they are +-pi rad or +-0.5 m.
     """
     axis = machine.axes[location]
     if axis.cylinder:
@@ -199,9 +204,9 @@ _MIN_COMPLIANCE_RATIO = 0.02  # of the smallest relevant compliance: below it, f
 
 
 def _presliding_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes with dry friction, without those driven by an own pump.
+    """Return the names of the axes whose drive has dry friction (Coulomb or Stribeck), except axes with an own pump.
 
-    The model of the latter has no presliding.
+    The model of axes with an own pump has no presliding.
     """
     found = {name: axis.drive.friction for name, axis in machine.axes.items() if not axis.pump}
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
@@ -227,9 +232,10 @@ def _presliding_parameters(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
-    """Return the machine with a friction stiffness of 1 / compliance before sliding.
+    """Return the machine with a friction stiffness of 1 / compliance before sliding, at one drive.
 
-    Below 2 % of the smallest relevant compliance the friction gets no spring, as in the rigid model.
+    Below 2 % of the smallest relevant compliance the stiffness is set to 0, which means dry
+    friction without a spring. With the present compliance, the machine is returned unchanged.
     """
     compliance = values["compliance"]
     number = _presliding_parameters(machine, location)["compliance"]

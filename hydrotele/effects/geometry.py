@@ -21,7 +21,8 @@ from hydrotele.machine.machine import Machine
 def _link_length_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the revolute axes whose link extends sideways from the joint axis.
 
-    The line to the next joint is more than 60 degrees from the axis: boom and stick, but not swing.
+    The line from the link's joint to the next joint, or to the arm's tip, is more than 60 degrees
+    from the joint axis. This applies to boom and stick, but not to swing.
     """
     places = []
     for axis in hinge_axes(machine):
@@ -156,9 +157,10 @@ def _base_tilt_locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _base_tilt_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal values (0), bounds and priors of roll and pitch of the machine's base.
+    """Return nominal values (0), bounds and priors of the tilt angles `roll` and `pitch` of the machine's base.
 
-    Ground is level to a few degrees. The smallest relevant angle is 3 mrad, which a spirit level resolves.
+    Ground is level to a few degrees. The smallest relevant angle is 3 mrad, which a spirit level
+    resolves.
     """
     tilt = Parameter("rad", 0.0, -0.2, 0.2, 0.03, 0.003)
     return {"roll": tilt, "pitch": tilt}

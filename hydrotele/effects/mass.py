@@ -17,7 +17,7 @@ _COORDINATES = "xyz"
 
 
 def _is_vertical_base_axis(machine: Machine, axis: str) -> bool:
-    """Return whether an axis of a link on the world is parallel to gravity (within 18 degrees).
+    """Return whether an axis moves a link attached to the world, about a line parallel to gravity (within 18 degrees).
 
     Weight then causes no torque about the axis.
     """
@@ -31,10 +31,11 @@ def _is_vertical_base_axis(machine: Machine, axis: str) -> bool:
 def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values (0), bounds and priors of the offsets of a link's centre of mass.
 
-    Bounds and priors are fractions of the size of the link. An offset parallel to the joint axis is
-    omitted, because it does not change the motion of the joint. The smallest relevant offset is 0.5 %,
-    about 25 mm of a boom, which changes the pressure in its cylinder by 40 kPa. It is six times larger
-    for a vertical axis, where weight causes no torque.
+    There is one offset per coordinate of the link's frame, in metres, except along the joint axis,
+    which does not change the motion of the joint. Bounds and priors are fractions of the size of
+    the link. The smallest relevant offset is 0.5 % of it, about 25 mm of a boom, which changes the
+    pressure in its cylinder by 40 kPa. For a vertical base axis, where weight causes no torque, it
+    is 3 %.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
     least = (0.03 if _is_vertical_base_axis(machine, location) else 0.005) * size
@@ -102,7 +103,10 @@ def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 
 def _set_payload(machine: Machine, location: str, values: Values) -> Machine:
-    """Return the machine with a point mass welded to the arm's tip, added to an existing payload."""
+    """Return the machine with a point mass of `mass` [kg] welded to the arm's tip, added to an existing payload.
+
+    A mass below 1 g changes nothing.
+    """
     assert machine.arm
     tip, mass = machine.arm.tip, values["mass"]
     if mass < _MIN_PAYLOAD_KG:

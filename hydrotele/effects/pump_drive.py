@@ -13,7 +13,7 @@ _SIDES = ("head", "rod")
 
 
 def _pump_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes that are driven by an own pump."""
+    """Return the names of the axes whose drive has its own pump instead of a valve."""
     return tuple(name for name, axis in machine.axes.items() if axis.pump)
 
 
@@ -96,10 +96,11 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
 
 
 def _motor_inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the common inertia of motor and pump.
+    """Return nominal value, bounds and prior of the inertia of a pump motor together with its pump.
 
-    It is usually known to tens of per cent. The bounds, a thirtieth and thirty times the given value,
-    include a wrong unit.
+    The inertia is usually known to tens of per cent; the prior standard deviation is 30 %, the
+    smallest relevant change 5 %. The bounds, a thirtieth and thirty times the given value, include
+    a wrong unit.
     """
     present = _get_pump_motor(machine, location).inertia
     return {"inertia": _proportional_parameter("kg m^2", present, 0.3, 0.05, 30.0)}
@@ -111,9 +112,11 @@ def _stall_torque(machine: Machine, location: str) -> float:
 
 
 def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal values, bounds and priors of dry drag and breakaway torque of motor and pump.
+    """Return nominal values, bounds and priors of `drag` (dry friction torque) and `breakaway` torque of a pump motor.
 
-    Bounds and priors are fractions of the motor's stall torque. Brushes and seals typically cause 5 % of it.
+    Both include the friction of the pump. Bounds and priors are fractions of the motor's stall
+    torque. Brushes and seals typically cause 5 % of that torque; the smallest relevant change
+    is 1 %.
     """
     motor, whole = _get_pump_motor(machine, location), _stall_torque(machine, location)
     return {
@@ -123,9 +126,11 @@ def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the viscous drag of motor and pump.
+    """Return nominal value, bounds and prior of the coefficient of viscous drag of motor and pump.
 
-    Bounds and prior are the same fractions as for dry drag, here of the stall torque over the rated speed.
+    Bounds and prior are fractions of the motor's stall torque over the pump's rated speed: 50 %
+    above the nominal value for the upper bound, 5 % for the prior standard deviation, 1 % for the
+    smallest relevant change.
     """
     present = _get_pump_motor(machine, location).viscous
     whole = _stall_torque(machine, location) / _get_axis_pump(machine, location).rated_speed
@@ -140,9 +145,9 @@ def _line_locations(machine: Machine) -> tuple[str, ...]:
 def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of compliance and air volume of a hose between pump and drive.
 
-    Bounds and priors are proportional to compliance and volume of the oil at mid-stroke. A hose is
-    typically several times more compliant than its oil. The air volume is stated at atmospheric
-    pressure; a few per cent of the oil volume are typical.
+    Bounds and priors are proportional to compliance and volume of the oil in the connected chamber
+    at mid-stroke. A hose is typically several times more compliant than its oil. The air volume is
+    stated at atmospheric pressure; a few per cent of the oil volume are typical.
     """
     axis, _, side = location.partition(".")
     drive, pump = machine.axes[axis].cylinder, _get_axis_pump(machine, axis)
@@ -164,10 +169,10 @@ def _set_lines(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the charge pressure of an axis' accumulator.
+    """Return nominal value, bounds and prior of the charge pressure of the accumulator of an axis' own pump.
 
-    It is set manually with an error of tens of per cent. The smallest relevant change is 2 %, the finest
-    mark of a gauge.
+    The pressure is set manually with an error of tens of per cent. The smallest relevant change is
+    2 %, the finest mark of a gauge.
     """
     present = _get_axis_pump(machine, location).accumulator.pressure
     return {"pressure": _proportional_parameter("Pa", present, 0.2, 0.02, 5.0)}
@@ -176,8 +181,8 @@ def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the relief pressure of a load cylinder.
 
-    It is set manually with an error of tens of per cent. The smallest relevant change is 2 %, the finest
-    mark of a gauge.
+    The pressure is set manually with an error of tens of per cent. The smallest relevant change is
+    2 %, the finest mark of a gauge.
     """
     present = machine.loads[location].relief_pressure
     return {"relief_pressure": Parameter("Pa", present, 0.0, 3.0 * present, 0.2 * present,
@@ -187,7 +192,8 @@ def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the seal friction of a load cylinder.
 
-    It is stated as a fraction of the load's force. Seals cause up to some tens of per cent.
+    The friction is a fraction of the load cylinder's force. Seals cause up to some tens of per
+    cent. The smallest relevant change is 0.02.
     """
     present = machine.loads[location].friction
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}

@@ -61,7 +61,8 @@ def _make_position_error_setter(field: str, parameter: str):
 def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of drift and warm-up time constant of a position sensor.
 
-    The drift is the additional offset of the warm sensor, with the bounds and prior of an offset.
+    The drift is the change of the sensor's offset from start to warm state. Its bounds about the
+    nominal drift and its prior are those of an offset. The time constant is optional.
     """
     error = _sensor_error(machine, _position_channel(machine, location))
     sizes = _angle_offset_parameters(machine, location)["offset"]
@@ -76,7 +77,7 @@ def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with another drift and warm-up time constant of a position sensor.
 
-    Without drift the time constant has no effect and is not set.
+    With a drift of 0 the time constant has no effect and is not set.
     """
     numbers = {"drift": values["drift"]}
     if values["drift"] and "time_constant" in values:
@@ -87,8 +88,8 @@ def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine
 def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the scale factor of a position sensor.
 
-    It differs from 1 with a wrong gear or reference voltage. The smallest relevant change is 0.3 %, the
-    linearity of an angle sensor over one radian.
+    The factor differs from 1 with a wrong gear or reference voltage. The smallest relevant change
+    is 0.3 %, the linearity of an angle sensor over one radian.
     """
     present = _sensor_error(machine, _position_channel(machine, location)).scale
     low, high = min(0.8, present), max(1.2, present)
@@ -111,7 +112,8 @@ def _angle_delay_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _sensor_lag_parameters(present: float) -> dict[str, Parameter]:
     """Return nominal value (`present` [s]), bounds and prior of the first-order time constant of a sensor.
 
-    Sensors and their filters have time constants of 1 to 50 ms.
+    Sensors and their filters have time constants of 1 to 50 ms. The smallest relevant change is 3
+    ms.
     """
     high = max(0.3, present)
     return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.01, 0.04))}
@@ -150,8 +152,9 @@ def _pressure_channel_of_location(location: str) -> str:
 def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the zero offset of a pressure transducer.
 
-    The typical offset is 0.5 % of the span, the accuracy class. The smallest relevant change is 0.07 %,
-    since the repeatability is better than 0.1 %.
+    Bounds and prior are fractions of the span, which is taken to be the highest feed pressure of
+    the axis. The typical offset is 0.5 % of it, the accuracy class. The smallest relevant change is
+    0.07 %, since the repeatability is better than 0.1 %.
     """
     present = _sensor_error(machine, _pressure_channel_of_location(location)).offset
     span = machine.max_feed_pressure(location.rpartition(".")[0])
@@ -166,8 +169,8 @@ def _set_pressure_offset(machine: Machine, location: str, values: Values) -> Mac
 def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the scale factor of a pressure transducer.
 
-    It differs from 1 with a wrong span setting or supply voltage. The smallest relevant change is 0.3 %,
-    about the accuracy of a calibrated transducer.
+    The factor differs from 1 with a wrong span setting or supply voltage. The smallest relevant
+    change is 0.3 %, about the accuracy of a calibrated transducer.
     """
     present = _sensor_error(machine, _pressure_channel_of_location(location)).scale
     low, high = min(0.8, present), max(1.2, present)
@@ -183,9 +186,7 @@ def _pressure_channels_of_axis(axis: str) -> tuple[str, ...]:
 
 
 def _common_delay_or_lag(machine: Machine, channels: tuple[str, ...], field: str) -> float:
-    """Return the smallest delay or time constant of several sensor channels [s].
-
-    It counts as the part that all of them have in common.
+    """Return the smallest delay or time constant of several sensor channels [s], which all of them have in common.
 
     Args:
         machine: the machine.
@@ -198,7 +199,8 @@ def _common_delay_or_lag(machine: Machine, channels: tuple[str, ...], field: str
 def _with_common_delay_or_lag(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
     """Return the machine with another common delay or time constant of several sensor channels.
 
-    The smallest one becomes `value` [s], and all others change by the same time, but not below 0.
+    The smallest delay or time constant becomes `value` [s]. Those of the other channels change by
+    the same time, but not below 0. `field` is `delay` or `time_constant`.
     """
     more = value - _common_delay_or_lag(machine, channels, field)
     for channel in channels:
@@ -228,8 +230,11 @@ def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machin
 def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
     """Return the groups of sensor channels that may have been recorded with a separate clock.
 
-    The groups are `positions` and `pressures`, each only if several axes have such sensors. For a single
-    axis, an offset of the clock is the same as a delay of its sensors.
+    The groups are `positions`, if the machine has several axes, and `pressures`, if it has several
+    hydraulic axes. For a single axis, an offset of the clock is the same as a delay of its sensors.
+
+    Returns:
+        Name of the group -> channel names.
     """
     pressures = tuple(c for c in machine.sensed_channels if c.startswith("pressure"))
     positions = tuple(c for c in machine.sensed_channels if not c.startswith("pressure"))
@@ -244,9 +249,10 @@ def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
 def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the time by which a group of sensors is recorded late.
 
-    The time is relative to commands and other sensors, and is never negative, because that would be a
-    response before its command. If one group is early relative to the other one, the other one is late.
-    Typical offsets are about 10 ms.
+    The time is relative to commands and other sensors. It is never negative, because readings would
+    then respond before their command. A group that is early relative to the other group is
+    described by a late other group. Typical offsets are about 10 ms; the smallest relevant change
+    is 3 ms.
     """
     present = _common_delay_or_lag(machine, _clock_groups(machine)[location], "delay")
     high = max(0.5, present)

@@ -9,9 +9,10 @@ def _supply_effect_locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _limited_flow_locations(machine: Machine) -> tuple[str, ...]:
-    """Return the location ("supply",), or () for machines whose pump does not limit the flow.
+    """Return ("supply",) as the only location, or () for a machine whose supply does not limit the flow.
 
-    A supply of constant pressure has no such limit.
+    A supply of constant pressure has no such limit. The result is also () without supply or valve
+    axes.
     """
     supply = machine.supply
     return _supply_effect_locations(machine) if supply and supply.kind != "constant_pressure" else ()

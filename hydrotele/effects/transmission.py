@@ -30,8 +30,9 @@ _DEFAULT_DAMPING_RATIO = 0.3  # damping ratio of the drive on its spring: oil an
 def make_stiff_transmission(machine: Machine, axis: str) -> Transmission:
     """Return a nearly rigid transmission of a drive, to which backlash or compliance can be added.
 
-    Its drive-side inertia is the rod's mass, or for a motor 3 % of the load inertia in the home pose.
-    Its spring is as stiff as steps of 1 ms resolve well: inertia and spring vibrate at 40 Hz.
+    The drive-side inertia is the rod's mass, or for a motor 3 % of the load inertia in the home
+    pose. The spring is so stiff that the drive-side inertia vibrates on it at 40 Hz, which a
+    simulation with steps of 1 ms resolves well. The damping ratio is 0.3, the backlash 0.
     """
     cylinder = machine.axes[axis].cylinder
     inertia = cylinder.rod.mass if cylinder else _DRIVE_INERTIA_FRACTION * load_inertia(machine, axis)
@@ -45,7 +46,7 @@ def make_stiff_transmission(machine: Machine, axis: str) -> Transmission:
 
 
 def spring_damping(inertia: float, stiffness: float) -> float:
-    """Return the damping of a spring for a damping ratio of 0.3 [N s/m] or [N m s/rad].
+    """Return the damping coefficient that gives an inertia on a spring a damping ratio of 0.3 [N s/m] or [N m s/rad].
 
     Args:
         inertia: mass [kg] or moment of inertia [kg m^2] on the spring.
@@ -69,9 +70,10 @@ def raise_to_resolvable_inertia(machine: Machine, axis: str, inertia: float, sti
 
 
 def natural_frequency(machine: Machine, axis: str) -> float:
-    """Return the natural frequency of the drive-side inertia of an axis [rad/s].
+    """Return the natural frequency of the drive-side inertia of an axis with a transmission [rad/s].
 
-    The inertia vibrates between the spring of the transmission and, for a hydraulic drive, the oil.
+    The inertia vibrates between the spring of the transmission and, for a hydraulic drive, the oil,
+    whose stiffness is that at the end of the stroke.
     """
     facts = machine.axes[axis]
     assert facts.transmission
@@ -80,9 +82,10 @@ def natural_frequency(machine: Machine, axis: str) -> float:
 
 
 def _oil_stiffness(machine: Machine, axis: str) -> float:
-    """Return the stiffness of the oil in both chambers at the end of the stroke [N/m] or [N m/rad].
+    """Return the stiffness of the oil in both chambers with the piston fully retracted [N/m] or [N m/rad].
 
-    It is the sum of bulk modulus times squared area over volume, largest where one chamber is empty.
+    It is the sum over both chambers of bulk modulus times squared area over volume. In this
+    position the head chamber has only its dead volume, so that the stiffness is largest.
     """
     drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
     assert machine.supply
@@ -92,10 +95,11 @@ def _oil_stiffness(machine: Machine, axis: str) -> float:
 
 
 def with_transmission(machine: Machine, axis: str, transmission: Transmission) -> Machine:
-    """Return a copy of a machine with a transmission in an axis.
+    """Return a copy of a machine with a transmission in an axis, which replaces a present one.
 
-    For a motor, the drive-side inertia is subtracted from the link, so that the total inertia about
-    the motor axis does not change. It is not subtracted if the link's inertia would become invalid.
+    For a motor, the drive-side inertia (minus that of a present transmission) is subtracted from
+    the driven link, so that the total inertia about the motor axis does not change. It is not
+    subtracted if the link's moments of inertia would become physically impossible.
     """
     facts = machine.axes[axis]
     before = facts.transmission.inertia if facts.transmission else 0.0
@@ -115,7 +119,8 @@ def with_transmission(machine: Machine, axis: str, transmission: Transmission) -
 def load_inertia(machine: Machine, axis: str) -> float:
     """Return the inertia [kg m^2] or mass [kg] that the joint of an axis moves in the home pose.
 
-    It is that of the links about the joint axis, without the cylinders.
+    For a hinge it is the moment of inertia of all links outboard of the joint about the joint's
+    axis, for a slide their mass. Cylinders are not included.
     """
     joint = machine.axes[axis].joint
     first = machine.link_of(joint)
@@ -217,7 +222,9 @@ def _transmission_damping_ratio(drive: Transmission) -> float:
 def _set_backlash(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with backlash in an axis: a motor-side inertia behind a stiff spring with a gap.
 
-    The inertia is subtracted from the driven link. Nothing changes for a gap below 1 urad.
+    The inertia is subtracted from the driven link. Parameters that are not stated keep the values
+    of the present transmission, or of `make_stiff_transmission`. Without a present transmission, a
+    gap below 1 urad changes nothing.
     """
     gap, before = values["gap"], machine.axes[location].transmission
     if gap < _MIN_BACKLASH_RAD and before is None:
@@ -284,10 +291,13 @@ def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parame
 def _set_flexibility(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with a spring of stiffness 1 / compliance between a drive and its load.
 
-    An existing backlash is kept. A cylinder's spring is in line with it, between piston and rod pin, so
-    that length sensor and oil follow the piston. The drive-side inertia is the stated value, otherwise
-    the rod's mass or 3 % of a motor's load inertia. It is increased if 1 ms steps could not resolve its
-    vibration on the spring.
+    An existing backlash is kept. A cylinder's spring is in line with it, between piston and rod
+    pin, so that length sensor and oil follow the piston. The drive-side inertia is the stated
+    value, otherwise that of the present transmission, or the rod's mass or 3 % of a motor's load
+    inertia. It is increased if 1 ms steps could not resolve its vibration on the spring.
+
+    The machine is returned unchanged if all stated values are nominal. It is also unchanged without
+    a present transmission if the compliance is below 2 % of the smallest relevant compliance.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
     table = _flexibility_parameters(machine, location)

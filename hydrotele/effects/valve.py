@@ -19,7 +19,10 @@ def _get_axis_valve(machine: Machine, location: str) -> Valve:
 
 
 def _common_deadband_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes with a valve whose deadband is not stated separately for both directions."""
+    """Return the names of the valve axes with at least one direction that has no separate deadband.
+
+    The common deadband of the valve has an effect only in such a direction.
+    """
     return tuple(
         name for name in valve_axes(machine)
         if any(way.deadband is None
@@ -105,7 +108,9 @@ DIRECTIONS = ("positive", "negative")
 def _direction_gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (1), bounds and prior of the ratio of true to given flow gain per direction.
 
-    They are the same numbers as for a ratio that is common to both directions of the valve.
+    The directions are `positive` and `negative`. The bounds are 0.05 and 5, the prior standard
+    deviation is 0.15, and the smallest relevant change 0.02, as for a ratio that is common to both
+    directions.
     """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02))
 
@@ -120,9 +125,10 @@ def _scale_direction_gains(machine: Machine, location: str, values: Values) -> M
 
 
 def _direction_deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of a valve's deadband for each direction.
+    """Return nominal value, bounds and prior of a valve's deadband for each direction, `positive` and `negative`.
 
-    The bounds are wider than for a common deadband, because a spool may rest off its centre.
+    The upper bound is 0.6 instead of the 0.3 of a common deadband, because a spool may rest off its
+    centre.
     """
     present = _get_axis_valve(machine, location).deadbands
     return {
@@ -158,9 +164,9 @@ _CURVE_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
 def _flow_curve_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (0), bounds and prior of the flow curve's progression for each direction.
 
-    The progression says how much less a valve opens over its first travel than a linear one; see
-    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Spools for fine control reach 0.6; the
-    smallest relevant progression is 0.04, as caused by notches (estimates).
+    A positive progression reduces the opening at small travel compared with a linear valve; see
+    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Spools for fine control reach
+    0.6; the smallest relevant progression is 0.04, as caused by notches (estimates).
     """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
@@ -176,10 +182,10 @@ def _set_flow_curve(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def bend_flow_curve(present: Metering, progression: float) -> FlowCurve:
-    """Return a valve's flow curve (opening over travel) for one direction, with added progression.
+    """Return a valve's flow curve (opening over spool travel) for one direction, with added progression.
 
-    The opening is multiplied by 1 - c + c t, where t is the travel from 0 to 1 and c the progression. The
-    full opening does not change.
+    The opening is multiplied by 1 - c + c t, where t is the travel from 0 to 1 and c the
+    progression. The full opening does not change.
 
     Args:
         present: metering of the direction; its opening is linear if it has no curve.
@@ -210,9 +216,9 @@ EDGE_FIELDS = {
 def _metering_edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the relative gain of each metering edge of a valve.
 
-    The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. In spools for
-    single-rod cylinders the gains differ by tens of per cent. The smallest relevant change is 3 %, as
-    caused by a notch (estimates).
+    The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. A gain
+    of 1 corresponds to the valve's rated flow. In spools for single-rod cylinders the gains differ
+    by tens of per cent. The smallest relevant change is 0.03, as caused by a notch (estimates).
     """
     valve = machine.axes[location].valve
     assert valve
@@ -238,11 +244,12 @@ METERING_EDGES = Effect(
 
 
 def _travel_time_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Return nominal value, bounds and prior of the time in which the spool opens fully.
+    """Return nominal value, bounds and prior of `travel_time`, in which the spool opens fully at its largest speed.
 
-    The spool moves at its largest speed for this time; 0 means no speed limit. With the bandwidth w of
-    the spool [rad/s], a full step without limit moves at most 0.38 w of the travel per second (damping
-    ratio 0.9). A limit therefore has an effect for times above 2.6 / w. Prior and bounds are estimates.
+    It is the reciprocal of the valve's slew limit; 0 means no speed limit. With the bandwidth w of
+    the spool [rad/s] and no limit, the spool moves by at most 0.38 w of its travel per second in a
+    full step (damping ratio 0.9). A limit therefore has an effect for times above 2.6 / w. Prior
+    and bounds are estimates.
     """
     valve = machine.axes[location].valve
     assert valve

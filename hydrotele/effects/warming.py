@@ -9,13 +9,13 @@ _WARMING_TIME_S = 300.0  # s, time constant of warming of a tank of some hundred
 
 
 def _viscous_friction(machine: Machine) -> dict[str, float]:
-    """Return axis -> coefficient of viscous friction [N s/m] or [N m s/rad], if it is not 0."""
+    """Return the coefficient of viscous friction of each axis [N s/m] or [N m s/rad], without axes where it is 0."""
     found = {name: axis.drive.friction.viscous for name, axis in machine.axes.items()}
     return {name: viscous for name, viscous in found.items() if viscous}
 
 
 def _leakage_coefficients(machine: Machine) -> dict[str, float]:
-    """Return axis -> leakage coefficient between the chambers [m^3/(s Pa)], if it is not 0."""
+    """Return the leakage coefficient between the chambers of each axis [m^3/(s Pa)], without axes where it is 0."""
     found = {n: axis.hydraulic_drive.leakage for n, axis in machine.hydraulic_axes.items()}
     return {name: leakage for name, leakage in found.items() if leakage}
 
@@ -27,8 +27,9 @@ def _warming_locations(machine: Machine) -> tuple[str, ...]:
 def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of the viscosity change by warming during a run.
 
-    The parameters are the ratio of final to initial viscosity and the time constant. Warming by 20 K
-    halves the viscosity. The smallest relevant change is 5 %, which corresponds to 2 K.
+    The parameters are the ratio of final to initial viscosity, 1 without the effect, and the time
+    constant of its change. Warming by 20 K halves the viscosity. The smallest relevant change of
+    the ratio is 0.05, which corresponds to 2 K.
     """
     term = next((term for term in machine.terms if term.name == NAME), None)
     present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _WARMING_TIME_S}
@@ -43,7 +44,8 @@ def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 def _set_warming(machine: Machine, location: str, values: Values) -> Machine:
     """Return the machine with viscous friction and leakage that change over time as the oil warms up.
 
-    The change applies to the part of the friction that is equal in both directions.
+    The change of the friction applies to the part that is equal in both directions. A viscosity
+    ratio of 1 removes the effect.
     """
     if values["ratio"] == 1.0:
         return with_terms(machine, NAME, [])

@@ -63,7 +63,10 @@ class MachineEnvironment(dm_env.Environment):
         self, task_name: str, random: int | np.random.RandomState | None, flat: bool,
         options: Mapping[str, Any],
     ) -> None:  # fmt: skip
-        """Compile the machine; the arguments are those of `load`, `flat` is its `flat_observation`."""
+        """Create the environment and compile the machine variants.
+
+        The arguments are those of `load`; `flat` is its `flat_observation`.
+        """
         self.core = make_task_core(task_name, dict(options), 1, 1, DISABLED)
         if random is None:
             random = int(np.random.default_rng().integers(2**62))
@@ -84,13 +87,13 @@ class MachineEnvironment(dm_env.Environment):
         return [field.name.partition(".")[0] for field in self.core.setup.fields]
 
     def reset(self) -> dm_env.TimeStep:
-        """Start an episode; the first one uses the seed."""
+        """Start an episode; the first one uses the seed, the others continue its random stream."""
         self.core.reset(None if self._is_started else np.array([self._seed]))
         self._is_started, self._is_over = True, False
         return dm_env.restart(self._grouped_observation())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Advance by one step, or start an episode if the last one is over.
+        """Advance by one step, or start a new episode without using the action if the last one is over.
 
         Args:
             action: (a,); values outside +-1 are clipped.
@@ -115,7 +118,10 @@ class MachineEnvironment(dm_env.Environment):
         return split_by_key(self.core.observation[0], self._key_indices)
 
     def observation_spec(self) -> collections.OrderedDict[str, specs.BoundedArray]:
-        """Return the bounds in SI units at which observations saturate; see `fields` for names."""
+        """Return the specifications of the observations, key -> shape and bounds in SI units.
+
+        Observations saturate at the bounds. The attribute `fields` names the values of each key.
+        """
         low, high = (
             split_by_key(ends, self._key_indices) for ends in (self.core.observation_low, self.core.observation_high)
         )
@@ -124,7 +130,7 @@ class MachineEnvironment(dm_env.Environment):
         )
 
     def action_spec(self) -> specs.BoundedArray:
-        """Return the action bounds, (a,) from -1 to 1; the name lists the axes, tab-separated."""
+        """Return the specification of the action, (a,) from -1 to 1; its name lists the actions, separated by tabs."""
         name, count = "\t".join(self.core.action_names), len(self.core.action_names)
         return specs.BoundedArray((count,), np.float32, -1.0, 1.0, name)
 
@@ -160,9 +166,9 @@ class MachineEnvironment(dm_env.Environment):
 
     @property
     def physics(self) -> "Physics":
-        """Current model with visual geometry, for dm_control's viewer and wrappers.
+        """dm_control physics of the current state, with visual geometry, for dm_control's viewer and wrappers.
 
-        Changes to it do not affect the simulation.
+        It is a copy: changes to it do not affect the simulation.
         """
         stage = self._get_renderer()
         if self._physics is None:
@@ -213,7 +219,7 @@ class Physics(engine.Physics):
 
 
 def group_indices_by_key(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
-    """Return the indices of every distinct key in a list, in order of first occurrence."""
+    """Return distinct key -> indices at which the key occurs in the list, in order of first occurrence."""
     places: collections.OrderedDict[str, list[int]] = collections.OrderedDict()
     for place, key in enumerate(keys):
         places.setdefault(key, []).append(place)
@@ -221,5 +227,8 @@ def group_indices_by_key(keys: list[str]) -> collections.OrderedDict[str, np.nda
 
 
 def split_by_key(values: np.ndarray, places: Mapping[str, np.ndarray]) -> collections.OrderedDict[str, np.ndarray]:
-    """Return a copy of the values of every key; `places` holds the indices of each key in `values`."""
+    """Return key -> copy of the values of this key.
+
+    `places` holds, for every key, the indices of its values in `values`.
+    """
     return collections.OrderedDict((key, values[some]) for key, some in places.items())

@@ -78,9 +78,11 @@ def _limit_change(now, goal, change):
 
 @compiled
 def _integrate_joint_rates(f, e, action, first):
-    """Integrate rate actions, from index `first` on, to the joint references of the servo.
+    """Integrate rate actions over one control period to the joint references of the servo.
 
-    Acceleration, joint range and lead over the measured joint are limited.
+    The actions from index `first` on are used. Acceleration, joint range and the lead of the
+    reference over the measured joint are limited; at the limits of range or lead, the reference
+    rate becomes 0.
     """
     for a in range(first, f.actions):
         i = f.driven_axis[a]
@@ -96,7 +98,11 @@ def _integrate_joint_rates(f, e, action, first):
 
 @compiled
 def _integrate_pose_rates(f, e, action):
-    """Integrate tip rate actions to the tip pose, and convert it to the joint references (resolved motion)."""
+    """Integrate tip rate actions over one control period, and convert the tip pose to joint references.
+
+    If the new pose is not reachable, the references are held. If a reference is too far from its
+    measured joint, the references are moved to a limited distance from the measured joints.
+    """
     k, wanted = f.arm_axes, np.empty(MAX_ARM_AXES)
     for c in range(MAX_ARM_AXES):
         goal = 0.0
@@ -123,12 +129,12 @@ def _integrate_pose_rates(f, e, action):
 
 @compiled
 def convert_action_to_commands(f, e, action):
-    """Convert the action into valve commands, or into references of the servo.
+    """Convert the action into valve commands, or into references of the joint servo, for one control period.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `command` is written for valve actions, the references and
-            `drive` for all others.
+        e: record of EPISODE_STATE; `command` is written for valve actions. For all others, joint
+            and pose references and `drive`, the references of the drives, are written.
         action: (actions,) of the agent; values outside +-1 are clipped.
 
     Returns:
@@ -160,7 +166,8 @@ def update_sensors(f, e, sim):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; true positions are always written, measured values if due.
+        e: record of EPISODE_STATE; true positions are always written; measured values, their random
+            errors and `sampled_reference` if a sample is due.
         sim: Simulation of this episode.
 
     Returns:
@@ -229,7 +236,7 @@ def _make_simulation_record(f, e, w):
 
 @compiled
 def _run_control_period(f, e, sim):
-    """Run the joint servo and then the physics steps of one control period."""
+    """Run the joint servo once and then the physics steps of one control period."""
     k, none = f.axes, np.zeros(f.axes)
     controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
     drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
@@ -242,7 +249,11 @@ def _run_control_period(f, e, sim):
 
 @compiled
 def _check_stability(f, e, d):
-    """Count and clear MuJoCo's warnings; return whether a state was infinite or NaN."""
+    """Count and clear the warnings of MuJoCo in mjData at the address `d`.
+
+    Returns:
+        Whether a position, velocity or acceleration was NaN, infinite or too large.
+    """
     warnings = carray(address_to_pointer(d + f.at_warning), (_WARNING_COUNT, 2), np.int32)  # (information, number)
     bad = False
     for kind in range(_WARNING_COUNT):
@@ -255,7 +266,10 @@ def _check_stability(f, e, d):
 
 @compiled
 def _begin_episode(f, e, w):
-    """Draw a variant, set the simulation to its start, and draw a new goal."""
+    """Draw a variant, set the simulation to its start state, and let the task draw a new goal.
+
+    Model parameters, sensors, references and counters of the episode are initialised.
+    """
     e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(draw_uniform(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
@@ -290,7 +304,11 @@ def _begin_episode(f, e, w):
 
 @compiled
 def _write_observation(f, e, w, address):
-    """Write the observation of a simulation to an array at `address`, clipped to its bounds."""
+    """Write the observation of a simulation, clipped to its bounds, to its row of the array at `address`.
+
+    Values outside the bounds are counted in `saturated`; a value that is not finite becomes the
+    lower bound.
+    """
     n = f.observations
     out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
     low = carray(address_to_pointer(f.low), (n,), np.float32)
@@ -305,7 +323,11 @@ def _write_observation(f, e, w, address):
 
 @compiled
 def _run_environment_step(f, e, w, action):
-    """Run one environment step; return the reward, `terminated` and `truncated`."""
+    """Run one environment step with an action and return the reward, `terminated` and `truncated`.
+
+    An unstable simulation gives the reward 0 and terminates. `truncated` is true after the last
+    step of the episode's duration.
+    """
     sim = _make_simulation_record(f, e, w)
     for _ in range(f.ticks):
         convert_action_to_commands(f, e, action)
@@ -352,9 +374,10 @@ def _step_or_reset_simulation(m, d, sim, argument):
 
 @callback(_SIGNATURE)
 def step_or_reset_simulation(m, d, sim, argument):
-    """Step or reset one simulation.
+    """Step or reset one simulation, and write observation, reward, `terminated` and `truncated`.
 
     The arguments are the addresses of mjModel and mjData, the index of the simulation and the address of
-    TASK_PARAMETERS, whose `call` selects step or reset.
+    TASK_PARAMETERS. Its `call` selects step or reset. In a step, its `autoreset` says whether an
+    episode that is over starts again.
     """
     _step_or_reset_simulation(m, d, sim, argument)

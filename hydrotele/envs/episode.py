@@ -180,7 +180,7 @@ _UNIT_SCALE = 2.0**-53
 
 @compiled
 def mix64(z):
-    """Mix the bits of a 64-bit integer, scalar (the SplitMix64 finaliser)."""
+    """Return a 64-bit integer, scalar, with its bits mixed by the SplitMix64 finaliser."""
     z = (z ^ (z >> _SHIFT_30)) * _MULTIPLIER_1
     z = (z ^ (z >> _SHIFT_27)) * _MULTIPLIER_2
     return z ^ (z >> _SHIFT_31)
@@ -223,10 +223,10 @@ def make_seed_states(seeds: np.ndarray) -> np.ndarray:
     """Return the initial generator states of a list of seeds.
 
     Args:
-        seeds: (n,) integers >= 0.
+        seeds: (n,) integers from 0 to 2^64 - 1.
 
     Returns:
-        (n,) values of `random`; consecutive seeds give unrelated streams.
+        (n,) values of `random` in EPISODE_STATE; consecutive seeds give unrelated streams.
 
     Raises:
         ValueError: a seed is not an integer from 0 to 2^64 - 1.

@@ -42,21 +42,22 @@ MAX_THREADS = 1024
 
 
 def check_count(name: str, count: int, least: int, most: int) -> None:
-    """Raise an error unless a count is an integer in a range.
+    """Raise an error unless a count is an integer from `least` to `most`.
 
     Raises:
-        InputError: the count is not an integer, or out of range.
+        InputError: the count is not an integer, or out of range; the message begins with `name`.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or not least <= count <= most:
         raise InputError(name, f"must be a whole number from {least} to {most}, not {count!r}")
 
 
 def make_task_setup(task: Task, options: Options) -> TaskSetup:
-    """Combine a task with the user's options: load its machines, observation and clocks.
+    """Combine a task with the user's options: clocks, nominal machine, its variants and observation fields.
 
     Args:
         task: the task.
-        options: the user's options.
+        options: the user's options; action and duration None are replaced by the defaults of the
+            task.
 
     Returns:
         The setup.
@@ -90,9 +91,10 @@ class TaskCore:
         episodes: (n,) records of EPISODE_STATE.
         observation: (n, o) float32.
         final_observation: (n, o) float32 observations before an autoreset in the same step.
-        reward: (n,).
-        terminated: (n,) uint8.
-        truncated: (n,) uint8.
+        reward: (n,) rewards of the last step.
+        terminated: (n,) uint8, whether the last step ended the episode by a condition of the task,
+            or because the simulation became unstable.
+        truncated: (n,) uint8, whether the last step ended the episode because its duration is over.
         measures: (n, MAX_MEASURES) task measures of the step, reported in `info`.
         final_measures: (n, MAX_MEASURES) the same before an autoreset in the same step.
     """
@@ -108,7 +110,7 @@ class TaskCore:
             options: the user's options.
             count: number of parallel episodes.
             threads: number of threads that step the episodes; 0 for one per core.
-            autoreset: NEXT_STEP, SAME_STEP or DISABLED.
+            autoreset: when an episode that ended is restarted: NEXT_STEP, SAME_STEP or DISABLED.
 
         Raises:
             InputError: an option is not valid for the task.
@@ -170,7 +172,7 @@ class TaskCore:
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Names of the actions: axes, or tip coordinates and the axes beyond the arm."""
+        """Names of the actions: driven axes, or tip coordinates and the driven axes that do not belong to the arm."""
         setup = self.setup
         if setup.options.action != "resolved_motion":
             return setup.axes
@@ -188,10 +190,11 @@ class TaskCore:
         return sum(array.nbytes for array in arrays) // self.count
 
     def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
-        """Start new episodes.
+        """Start new episodes in all simulations or in the chosen ones.
 
         Args:
-            seeds: (m,) integers; None continues the random stream of each episode.
+            seeds: (m,) integers, one per simulation to reset; None continues the random stream of
+                each episode.
             chosen: (m,) indices of simulations, None for all.
 
         Raises:
@@ -237,14 +240,14 @@ class TaskCore:
         self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data)
 
     def step_single(self, action: np.ndarray) -> None:
-        """Advance a single episode; like `step`, but the action must have shape (a,)."""
+        """Advance all episodes, normally a single one, like `step`; the action must have shape (a,)."""
         wanted = self.action.shape[1:]
         if np.shape(action) != wanted:
             raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
         self.step(action)
 
     def copy_model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Return copies of the model and data of one simulation, after `mj_forward`."""
+        """Return copies of the MuJoCo model and data of the simulation `number`, after `mj_forward`."""
         model = copy.copy(self.setup.variants.plant.model)
         data = mujoco.MjData(model)
         self.simulations.copy_model_into(number, model)

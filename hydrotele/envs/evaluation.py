@@ -33,7 +33,7 @@ class Scores:
         return float(self.results[name].mean())
 
     def standard_error(self, name: str) -> float:
-        """Return the standard error of the mean of a result."""
+        """Return the standard error of the mean of a result over the episodes; infinite for a single episode."""
         values = self.results[name]
         return float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.inf
 
@@ -76,7 +76,10 @@ def evaluate_controller(core: TaskCore, controller: Controller, episodes: int, s
 
 
 def _run_episode_batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
-    """Run one batch of newly started episodes to their end and return the results."""
+    """Run n newly started episodes to their end and return the results, name -> (n,).
+
+    The names are those of `Scores.results`.
+    """
     n, names = core.count, [name for name, _ in core.setup.task.measures]
     total, steps = np.zeros(n), np.zeros(n)
     sums, squares = np.zeros((n, len(names))), np.zeros((n, len(names)))

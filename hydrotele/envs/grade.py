@@ -81,7 +81,12 @@ def profile_section_radii() -> list[float]:
 
 
 def list_grade_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_grade_observation` writes: profile errors, edge height, mass, plane."""
+    """Return name, unit and bounds of the values that `write_grade_observation` writes.
+
+    They are the mean height of the ground above the target plane in each profile section, the
+    height of the bucket's edge above the ground, the mass carried, and height and slope of the
+    plane.
+    """
     far = max_reach(machine)
     fields = [ObservationField(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(SECTION_COUNT)]
     return [
@@ -95,7 +100,7 @@ def list_grade_observation_fields(machine: Machine, axes: tuple[str, ...]) -> li
 
 @compiled
 def target_plane_height(g, r):
-    """Return the height of the target plane at a radius.
+    """Return the height of the target plane above the level of the tracks, at a radius from the swing axis.
 
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
@@ -115,7 +120,7 @@ def compute_profile_error(g, surface, first, last):
 
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
-        surface: (CELL_COUNT,) heights [m].
+        surface: (CELL_COUNT,) heights of the ground [m].
         first: index of the first cell, scalar [1].
         last: index after the last cell, scalar [1].
 
@@ -143,11 +148,12 @@ def _add_mound(surface, middle, half, height):
 
 @compiled
 def draw_grade_episode(f, e, w):
-    """Draw the goal and terrain of an episode: soil, ground with two mounds, and target plane.
+    """Draw the goal and terrain of an episode: kind of soil, ground with two mounds, and target plane below it.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; soil index and target plane are written to `goal`.
+        e: record of EPISODE_STATE; soil index, target plane and RMS error of the profile are
+            written to `goal`.
         w: SimulationView; `terrain` and, in `measures`, RMS error and soil index are written.
 
     Returns:
@@ -187,11 +193,14 @@ def draw_grade_episode(f, e, w):
 
 @compiled
 def write_grade_observation(f, e, w, out, at):
-    """Write profile errors, height of the edge above ground, mass carried and plane to the observation.
+    """Write profile errors, height of the edge above ground, mass carried and target plane to the observation.
+
+    The profile errors are the mean heights of the ground above the plane, per section. If the
+    sensors have random errors, uniform errors are added to all these values but the plane.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE.
+        e: record of EPISODE_STATE; `random` is advanced if errors are drawn.
         w: SimulationView.
         out: (observations,) float32, written from index `at` on.
         at: index of the first value to write, scalar.
@@ -219,14 +228,17 @@ def write_grade_observation(f, e, w, out, at):
 
 @compiled
 def compute_grade_reward(f, e, w):
-    """Compute the reward from the decrease of the profile error, minus a time cost.
+    """Compute the reward of a step: 1 per 0.01 m by which the RMS profile error decreases, minus 0.05 per second.
+
+    An error below MAX_GRADED_ERROR for HOLD_TIME adds 5 and ends the episode (success). An edge
+    more than FAILURE_DEPTH below the target plane adds -5 and ends it (spoiled).
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` receives the RMS error and the time for which it was small.
+        e: record of EPISODE_STATE; `goal` receives the RMS error [m] and the time for which it has
+            been below MAX_GRADED_ERROR [s].
         w: SimulationView; `measures` receives the RMS error [m], mass carried [kg], soil force [N] and index
-            of the soil. Two more values are 0 or 1: whether the ground has been flat for long enough
-            (success), and whether the edge went so far below the target plane that the episode fails.
+            of the soil, then success and spoiled as 0 or 1.
 
     Returns:
         (reward, whether the episode ends), scalars.
@@ -265,12 +277,15 @@ _MAX_START_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw random arm positions with the bucket above the far end of the ground, ready to dig."""
+    """Return random start positions, arm axis -> [rad], with the bucket above the far end of the ground."""
     return sample_start_positions(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
 
 
 def _make_soil_bed_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
-    """Return the MAX_PARAMETERS task parameters: bucket, profile and soils, and last the number of soils."""
+    """Return the MAX_PARAMETERS task parameters: bucket, profile and soils, and last the number of soils.
+
+    Unused values between them are 0.
+    """
     bed = pack_soil_bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
     return (*bed, *[0.0] * (MAX_PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
@@ -308,7 +323,14 @@ GRADE = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `Grade` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw soil and target plane of a new episode), TICK (advance the soil by a
+    control period), OBSERVE (write the task's values to the observation, from the address `out` on)
+    or REWARD (return the reward and store whether the episode ends). `m`, `d` and `argument` are
+    the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -41,7 +41,8 @@ def make_info(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
 
     Args:
         core: the running task.
-        final: whether to return the values before an autoreset in the same step.
+        final: whether to return, for episodes that ended and were reset in this step, the values at
+            their end instead of those of the new episodes.
 
     Returns:
         Name -> (n,) values; `fault` is True if the simulation became unstable.
@@ -65,7 +66,7 @@ def check_render_mode(mode: str | None, known: list[str]) -> None:
 
 
 def add_render_fps(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:
-    """Return the metadata with `render_fps` set to the environment steps per second [Hz]."""
+    """Return a copy of the metadata with `render_fps` set to the environment steps per second [Hz]."""
     rate = core.setup.options.control_rate
     return {**metadata, "render_fps": int(rate) if rate == int(rate) else rate}
 
@@ -76,7 +77,7 @@ _OPEN_WINDOWS: list["TaskWindow"] = []  # at most one: GLFW supports one thread 
 
 
 class TaskWindow:
-    """A passive viewer of the first simulation of a task; the user may close it.
+    """A window with MuJoCo's passive viewer of the first simulation of a task; the user may close it.
 
     A process has at most one viewer; opening another closes the first. Call
     `show.live_window.check_screen` before, since MuJoCo's viewer hangs without a screen.
@@ -86,7 +87,7 @@ class TaskWindow:
         """Open the viewer.
 
         Args:
-            stage: the scene to show.
+            stage: renderer of the task, whose model and data are shown.
             camera: see `TaskRenderer.find_camera`; the user may select another one in the viewer.
             rate: frames per second of simulated time [Hz].
 
@@ -111,7 +112,10 @@ class TaskWindow:
             self._viewer.cam.lookat[:] = view.lookat
 
     def show(self) -> None:
-        """Show the current state and wait for real time; do nothing if the viewer is closed."""
+        """Show the current state and the markers of the goal, then wait until the next frame is due in real time.
+
+        If the user has closed the viewer, nothing is done.
+        """
         if not self._viewer.is_running():
             return
         with self._viewer.lock():
@@ -126,7 +130,10 @@ class TaskWindow:
         time.sleep(self._next_time - now)
 
     def close(self) -> None:
-        """Close the viewer and wait for its threads, before Python unloads GLFW."""
+        """Close the viewer and wait until its threads have ended.
+
+        This must happen before Python unloads the window library GLFW.
+        """
         if self in _OPEN_WINDOWS:
             _OPEN_WINDOWS.remove(self)
             atexit.unregister(self.close)
@@ -150,7 +157,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self, task: str, render_mode: str | None = None, width: int = 640, height: int = 480,
         camera: Camera = None, **options: Any,
     ) -> None:  # fmt: skip
-        """Compile the machine.
+        """Create the environment: compile the machine variants and define observation and action space.
 
         Args:
             task: name of the task, as in `hydrotele/<Name>-v0`.
@@ -180,10 +187,11 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode with a random variant and goal.
+        """Start an episode with a random machine variant and a random goal.
 
         Args:
-            seed: integer >= 0; None continues the random stream.
+            seed: seed of the random stream, an integer >= 0; None continues the stream, or starts a
+                random one in the first call.
             options: not used.
 
         Returns:
@@ -270,7 +278,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Gymnasium vector environment with n environments of a task.
 
-    Each environment gives exactly the same values as a single environment with the same seed.
+    Each environment gives bit for bit the same values as a single environment with the same seed.
 
     Attributes:
         core: the running task.
@@ -283,7 +291,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, width: int = 640,
         height: int = 480, camera: Camera = None, render_count: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
-        """Compile the machines.
+        """Create the environments: compile the machine variants and define observation and action spaces.
 
         Args:
             task: name of the task.
@@ -291,7 +299,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             render_mode: None or `rgb_array`.
             threads: number of threads that step the environments; 0 for one per core. Results do
                 not depend on it.
-            autoreset_mode: autoreset mode of gymnasium.
+            autoreset_mode: mode of gymnasium that says when an environment whose episode ended is
+                reset.
             width: width of images [pixel].
             height: height of images [pixel].
             camera: a camera of the machine; None for a free camera that shows the whole workspace
@@ -319,11 +328,11 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start episodes.
+        """Start new episodes in all environments, or in those that a mask selects.
 
         Args:
             seed: seed of the first environment, to which the others add their index; or one seed
-                per environment.
+                per environment. None continues the random stream of each environment.
             options: `reset_mask` (n,) bool selects the environments; all without it.
 
         Returns:
@@ -364,7 +373,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)])
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all environments by one step, with the autoreset mode for finished episodes.
+        """Advance all environments by one step; those whose episode ended are reset as the autoreset mode says.
 
         Args:
             actions: (n, a); values outside +-1 are clipped.
@@ -394,7 +403,10 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return _add_validity_masks(make_info(self.core), there)
 
     def _add_final_infos(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
-        """Add the final observations and infos of the episodes that were reset in this step."""
+        """Return `infos` with the final observations and final infos of the episodes that were reset in this step.
+
+        `over` (n,) is True for these episodes.
+        """
         observations = np.full(self.num_envs, None, dtype=object)
         for number in np.flatnonzero(over):
             observations[number] = self.core.final_observation[number].copy()
@@ -431,5 +443,9 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _add_validity_masks(infos: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Add to every entry `name` of `infos` a mask `_name` (n,) of the environments for which it is valid."""
+    """Return `infos` with a mask added for every entry.
+
+    The entry `name` gets the mask `_name`, (n,) bool: a copy of `mask`, True for the environments
+    for which the entry is valid.
+    """
     return infos | {f"_{name}": mask.copy() for name in infos}

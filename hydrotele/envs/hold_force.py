@@ -50,7 +50,10 @@ PLATE_QPOS, PLATE_DOF, PLATE_JOINT, CENTRE_X, CENTRE_Y, HALF_X, HALF_Y = range(7
 
 
 def list_force_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_force_observation` writes: measured and reference force, time."""
+    """Return name, unit and bounds of the values that `write_force_observation` writes.
+
+    They are the measured force, the reference force and the time since its last change.
+    """
     return [
         ObservationField("force", "N", -_CELL_RANGE, _CELL_RANGE),
         ObservationField("reference_force", "N", 0.0, MAX_FORCE),
@@ -85,8 +88,9 @@ def draw_force_references(f, e, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; both forces and the time are written to `goal`.
-        w: SimulationView.
+        e: record of EPISODE_STATE; both forces and the time are written to `goal`, and the first
+            measured force.
+        w: SimulationView, from which the first true and measured force are computed.
 
     Returns:
         Nothing.
@@ -107,7 +111,7 @@ def draw_force_references(f, e, w):
 
 @compiled
 def _sample_load_cell(f, e, w):
-    """Update the true force, and sample the load cell if a sensor sample is due."""
+    """Store the true force on the plate in `goal`, and also the load cell's reading if a sensor sample is due."""
     e.goal[_TRUE_FORCE] = compute_plate_force(f, w)
     if e.tick % f.every == 0:
         error = draw_uniform_between(e, -MAX_CELL_ERROR, MAX_CELL_ERROR) if f.noisy else 0.0
@@ -116,7 +120,9 @@ def _sample_load_cell(f, e, w):
 
 @compiled
 def update_force_measurement(f, e, w):
-    """Update the true force, the load cell reading and the maximum force of this step, after a control period.
+    """Update the force on the plate after a control period: true value, load cell reading and maximum.
+
+    The maximum is that of the true force since the start of the environment step.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -134,11 +140,11 @@ def update_force_measurement(f, e, w):
 
 @compiled
 def reference_force(g, time):
-    """Return the reference force at a time, and the time since it last changed or the episode started.
+    """Return the reference force at a time, and the time for which it has had this value.
 
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
-        time: since the start, scalar [s].
+        time: time since the start of the episode, scalar [s].
 
     Returns:
         (force [N], time [s]), scalars.
@@ -171,13 +177,16 @@ def write_force_observation(f, e, out, at):
 
 @compiled
 def compute_force_reward(f, e, w):
-    """Compute the reward from the true force; an overload or leaving the plate ends the episode.
+    """Compute the reward of a step: 1 minus the relative error of the true force, at least -1.
+
+    The episode ends with a reward of -50 if the force exceeded OVERLOAD_FORCE during the step, or
+    if the tip is no longer over the plate.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; the maximum force in `goal` is reset to 0.
-        w: SimulationView; `measures` receives the force error [N] and, as 0 or 1, contact with the plate, an
-            overload, and a tip that is no longer over the plate.
+        w: SimulationView; `measures` receives the true minus the reference force [N] and, as 0 or
+            1, contact with the plate, an overload, and a tip that is no longer over the plate.
 
     Returns:
         (reward, whether the episode ends), scalars.
@@ -208,12 +217,16 @@ _START_HEIGHTS = (0.05, 0.15)  # m, initial height of the tip above the plate
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw random arm positions with the bucket over the centre of the plate, teeth down."""
+    """Return random start positions, arm axis -> [rad], with the bucket over the centre of the plate, teeth down."""
     return sample_start_positions(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
 def _sample_plate(machine: Machine, rng: np.random.Generator, start: dict[str, float]) -> tuple[SurroundingObject, ...]:
-    """Return a spring-mounted plate below the tip, with random stiffness and height."""
+    """Return a plate on a spring, 0.05 to 0.15 m below the tip, with random stiffness and height.
+
+    `start` holds the positions of the arm axes at the start [rad]. The result is a tuple with this
+    plate.
+    """
     numbers, axes, _ = arm_specification(machine)
     pose = np.zeros(5)
     compute_tip_pose(numbers, np.array([start[name] for name in axes]), pose)
@@ -225,7 +238,11 @@ def _sample_plate(machine: Machine, rng: np.random.Generator, start: dict[str, f
 
 
 def _make_plate_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
-    """Return the indices of the plate in the model, its centre and its half sizes."""
+    """Return the task parameters of the plate, in the order of the constants PLATE_QPOS to HALF_Y.
+
+    They are the index of the plate in `qpos`, that in `qvel`, the id of its joint, its centre (x,
+    y) and its half sizes [m].
+    """
     joint = model.joint("plate_0")
     return (joint.qposadr[0], joint.dofadr[0], joint.id, *_CENTRE, *_HALF_SIZE)
 
@@ -259,7 +276,14 @@ HOLD_FORCE = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `HoldForce` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw the reference forces of a new episode), TICK (measure the force), OBSERVE
+    (write the task's values to the observation, from the address `out` on) or REWARD (return the
+    reward and store whether the episode ends). `m`, `d` and `argument` are the addresses of
+    mjModel, mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -42,7 +42,8 @@ class ObservationField(NamedTuple):
 def make_position_observation_field(machine: Machine, axis: str, what: str = "") -> ObservationField:
     """Return the observation field (name, unit, bounds) of an axis position.
 
-    `what` is the quantity in the name; the default is `angle` or `position`.
+    `what` is the quantity in the name; if empty, it is `angle` or `position`, by the kind of joint.
+    The bounds exceed the joint range by 0.15 rad or m.
     """
     low, high = machine.joints[machine.axes[axis].joint].range or (-_SWING_BOUND, _SWING_BOUND)
     kind = machine.position_kind(axis)
@@ -57,7 +58,10 @@ def make_rate_observation_field(machine: Machine, axis: str, what: str = "rate")
 
 
 def make_pose_observation_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[ObservationField]:
-    """Return the observation fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
+    """Return the observation fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm.
+
+    `what` is the first part of their names, for example `tip.r`.
+    """
     far = max_reach(machine)
     fields = [
         ObservationField(f"{what}.r", "m", 0.0, far),
@@ -70,7 +74,7 @@ def make_pose_observation_fields(machine: Machine, arm_axes: int, what: str = "t
 
 
 def max_reach(machine: Machine) -> float:
-    """Return an upper bound of the tip radius [m]: the sum of all link lengths."""
+    """Return an upper bound of the tip radius [m]: the sum of the lengths of all links and of the tip offset."""
     lengths = [float(np.linalg.norm(link.position)) for link in machine.links.values()]
     assert machine.arm
     return sum(lengths) + float(np.linalg.norm(machine.arm.tip.position))

@@ -76,7 +76,7 @@ def pack_grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnG
 
 @compiled
 def is_log_held(f, w):
-    """Return whether the grapple holds the log.
+    """Return whether the grapple holds the log, that is, whether the weld constraint between them is active.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -247,7 +247,11 @@ _RATE_BOUND = 10.0  # rad/s, bound of the difference quotient of noisy samples
 
 
 def list_place_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_place_observation` writes: log, goal, held, free joints."""
+    """Return name, unit and bounds of the values that `write_place_observation` writes.
+
+    They are the poses of log and goal, whether the log is held, and angles and rates of the two
+    free joints from which the grapple swings.
+    """
     far = 2.0 * max_reach(machine)
     fields = []
     for what, high in (("log", ("z",)), ("goal", ())):
@@ -266,12 +270,14 @@ def list_place_observation_fields(machine: Machine, axes: tuple[str, ...]) -> li
 
 @compiled
 def draw_log_poses(f, e, w):
-    """Draw the start pose and the goal pose of the log.
+    """Draw the start pose and the goal pose of the log on the ground, both with random yaw.
+
+    The swing of the grapple is measured for the first time.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
         e: record of EPISODE_STATE; the goal pose is written to `goal`.
-        w: SimulationView; the log's coordinates are written.
+        w: SimulationView; the log's coordinates in `qpos` are written.
 
     Returns:
         Nothing.
@@ -375,14 +381,21 @@ def write_place_observation(f, e, w, out, at):
 def compute_place_reward(f, e, w):
     """Compute the reward of a step for moving the grapple to the log and the log to its goal.
 
+    It is 1 per metre by which the remaining distance decreases: distance and yaw error of the log
+    and, while the log is neither held nor at its goal, also distance and misalignment of the
+    grapple. Every step costs 0.005, plus 0.02 per radian of the grapple's tilt. The first grip adds
+    5. A released log that has lain within the tolerances of its goal for HOLD_TIME is placed, which
+    adds 20; one out of reach adds -20.
+
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` receives the remaining distance and the time at the goal.
+        e: record of EPISODE_STATE; `goal` receives the remaining distance, the time at the goal,
+            and whether the log has been gripped.
         w: SimulationView; `measures` receives the distance [m] and yaw error [rad] of the log, whether it is
             held, whether it is placed, and the angle of the grapple to the vertical [rad].
 
     Returns:
-        (reward, whether the log is placed or out of reach), scalars.
+        (reward, whether the episode ends because the log is placed or out of reach), scalars.
 
     Source: this module.
     """
@@ -427,7 +440,11 @@ _MIN_START_POSE, _MAX_START_POSE = (
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw random joint positions with the open grapple hanging vertically above the height of a log."""
+    """Return random start positions, joint or axis -> [rad].
+
+    The open grapple hangs vertically with random rotation. The pin at the stick's tip is 2.2 to 2.8
+    m high.
+    """
     joints = sample_start_positions(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(rng.uniform(-0.5, 0.5) * math.pi)
@@ -477,7 +494,14 @@ PLACE_LOG = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `PlaceLog` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw start and goal pose of the log), TICK (grip or release the log, and
+    measure), OBSERVE (write the task's values to the observation, from the address `out` on) or
+    REWARD (return the reward and store whether the episode ends). `m`, `d` and `argument` are the
+    addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -52,7 +52,11 @@ _TARGET, _TIME_HELD, _REMAINING_DISTANCE = 0, 5, 6  # indices in `goal`
 
 
 def list_reach_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_reach_observation` writes: goal pose, measured distance, time held."""
+    """Return name, unit and bounds of the values that `write_reach_observation` writes.
+
+    They are the goal pose, the measured distance of the tip to it, and the time for which it has
+    been held.
+    """
     return [
         *make_pose_observation_fields(machine, len(axes), "reference"),
         ObservationField("distance", "m", 0.0, 2.0 * max_reach(machine)),
@@ -62,11 +66,16 @@ def list_reach_observation_fields(machine: Machine, axes: tuple[str, ...]) -> li
 
 @compiled
 def draw_reach_goal(f, e):
-    """Draw a goal pose that the arm can reach on a straight path from its start.
+    """Draw a goal pose of an episode that the arm can reach on a straight path from its start pose.
+
+    Poses are drawn again until the path lies in the workspace (`compute_path_effort` is finite).
+    After 100 draws, the path is shortened with every draw. The last of 140 draws is kept in any
+    case.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; the goal pose is written to `goal`.
+        e: record of EPISODE_STATE; the goal pose, the remaining distance to it and the time held,
+            0, are written to `goal`.
 
     Returns:
         Nothing.
@@ -98,15 +107,15 @@ def compute_pose_errors(target, x, y, z, attitude, head):
 
     Args:
         target: (MAX_ARM_AXES,) goal pose: r [m], theta [rad], z [m], attitude, head [rad].
-        x: position of the tip, scalar [m].
-        y: position of the tip, scalar [m].
-        z: position of the tip, scalar [m].
+        x: position of the tip in the world frame, scalar [m].
+        y: the same along y, scalar [m].
+        z: the same along z, scalar [m].
         attitude: angle of the tilt link to the horizontal, scalar [rad].
         head: angle of the head, scalar [rad].
 
     Returns:
-        (distance [m], angle [rad]), scalars; the angle is the larger of the attitude and head
-        errors.
+        (distance of the tip from the goal position [m], angle [rad]), scalars; the angle is the
+        larger of the absolute errors of attitude and head.
 
     Source: this module.
     """
@@ -130,7 +139,9 @@ def _compute_true_pose_errors(f, e):
 
 @compiled
 def write_reach_observation(f, e, out, at):
-    """Write the goal pose, the measured distance to it, and the time it has been held to the observation.
+    """Write the goal pose, the measured distance to it, and the time for which it has been held to the observation.
+
+    The distance is that of the tip position that follows from the measured joint positions.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -157,16 +168,18 @@ def write_reach_observation(f, e, out, at):
 def compute_reach_reward(f, e, w):
     """Compute the reward of a step from the decrease of the remaining distance to the goal pose.
 
-    Holding the pose for `HOLD_TIME` pays an extra reward and ends the episode.
+    The distance is that of the true pose; 1 rad of the larger angle error counts as 1 m. The reward
+    is 1 per metre minus 0.01 per step. Holding the pose within the tolerances (MAX_DISTANCE,
+    MAX_ANGLE) for HOLD_TIME adds 10 and ends the episode.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` receives the remaining distance and the time held.
         w: SimulationView; `measures` receives the distance [m], the larger error of attitude and head [rad],
-            and, as 0 or 1, whether the pose has been held for `HOLD_TIME`.
+            and, as 0 or 1, whether the pose has been held for HOLD_TIME.
 
     Returns:
-        (reward, whether the pose was reached), scalars.
+        (reward, whether the episode ends because the pose has been held), scalars.
 
     Source: this module.
     """
@@ -184,7 +197,7 @@ def compute_reach_reward(f, e, w):
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw random arm positions with the head in the air in front of the machine, about level."""
+    """Return random start positions, arm axis -> [rad], with the head in the air before the machine, about level."""
     return sample_start_positions(
         machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
     )  # fmt: skip
@@ -213,7 +226,14 @@ REACH_FELLER = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `ReachFeller` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw the goal pose of a new episode), TICK (do nothing), OBSERVE (write
+    the task's values to the observation, from the address `out` on) or REWARD (return the reward
+    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
+    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -32,7 +32,6 @@ from hydrotele.kinematics.task_space import (
     TOOL_ALONG,
     compute_tip_pose,
 )
-from hydrotele.show.logged_poses import compile_visual_model
 from hydrotele.show.offscreen_renderer import (
     Canvas,
     Marker,
@@ -43,6 +42,7 @@ from hydrotele.show.offscreen_renderer import (
     make_polyline_markers,
 )
 from hydrotele.simulate.batch import STATE_KIND
+from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.soil.parameters import CAT215
 
 _BANK_COLOUR, _LOOSE_COLOUR = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
@@ -50,14 +50,17 @@ _MIN_LOOSE_THICKNESS = 1e-3  # m, maximum thickness of loose soil that is not dr
 
 
 def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of the machine's upper structure, and thus of the plane of the arm."""
+    """Return the rotation matrix (3, 3) by which the upper structure and the plane of the arm are rotated.
+
+    It follows from the true swing angle of the simulation `number`.
+    """
     swing = float(core.episodes["position"][number][0])
     c, s = math.cos(swing), math.sin(swing)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def make_soil_markers(core: TaskCore, number: int) -> list[Marker]:
-    """Return boxes for the cells of the soil profile of an episode.
+    """Return boxes for the cells of the soil profile of an episode: undisturbed bank, and loose soil on it.
 
     Args:
         core: the running task, with a bed of soil.
@@ -140,7 +143,7 @@ def pose_to_cartesian_position(pose: np.ndarray) -> np.ndarray:
 
 
 def _make_track_markers(core: TaskCore, number: int) -> list[Marker]:
-    """Return markers of the reference tip position, its future path and the tip error."""
+    """Return markers of the reference tip position, its path over the next 3 s and the tip error."""
     episode, k = core.episodes[number], core.setup.arm_axes
     now = float(episode["tick"]) * core.setup.clock.period
 
@@ -250,7 +253,7 @@ Camera = str | int | None
 
 
 class TaskRenderer:
-    """A model with visual geometry that shows any simulation of a task.
+    """Renderer of the simulations of a task; it holds a model with visual geometry.
 
     Attributes:
         model: model with visual geometry; `update` sets its parameters to those of the variant shown.
@@ -277,7 +280,7 @@ class TaskRenderer:
         machine, things = variants.machines[variant], variants.surroundings[variant]
         key = id(machine), repr(things)
         if key not in self._cached_models:
-            model = compile_visual_model(machine, task.ground, things)
+            model = compile_mechanism(machine, ground=task.ground, surroundings=things)
             assert mujoco.mj_stateSize(model, STATE_KIND) == self._core.simulations.state.shape[1]
             self._set_free_camera(model)
             self._cached_models[key] = model
@@ -286,7 +289,7 @@ class TaskRenderer:
         return self._cached_models[key]
 
     def _set_free_camera(self, model: mujoco.MjModel) -> None:
-        """Set MuJoCo's free camera to show the whole workspace of the arm."""
+        """Set the default view of the model's free camera so that it shows the whole workspace of the arm."""
         machine = self._core.setup.machine
         if machine.arm:
             numbers = arm_specification(machine)[0]
@@ -309,7 +312,7 @@ class TaskRenderer:
         mujoco.mj_forward(self.model, self.data)
 
     def make_markers(self, number: int = 0) -> list[Marker]:
-        """Return the markers of the goal of a simulation."""
+        """Return the markers that show the goal of the simulation `number`, in the world frame."""
         return make_goal_markers(self._core, number)
 
     def find_camera(self, which: Camera = None) -> mujoco.MjvCamera:
@@ -338,7 +341,9 @@ class TaskRenderer:
         return camera
 
     def render(self, number: int = 0, width: int = 640, height: int = 480, camera: Camera = None) -> np.ndarray:
-        """Render a simulation; the OpenGL context is reused for images of the same size.
+        """Render the current state of a simulation with the markers of its goal.
+
+        The OpenGL context is reused for images of the same size.
 
         Args:
             number: index of the simulation.
@@ -369,7 +374,7 @@ class TaskRenderer:
 
 
 def copy_model_parameters(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
-    """Copy the parameters of a model to another model of the same structure.
+    """Copy the parameters of a model, except those of `opt`, to another model of the same structure.
 
     Args:
         source: the model to copy from.

@@ -1,4 +1,4 @@
-"""Bed of soil of an episode in the vertical plane of the arm, with which it rotates.
+"""Bed of soil of an episode, in the vertical plane of the arm; the bed rotates with the arm.
 
 `SimulationView.terrain` has slices for the profile, the bucket state, the result of the last step
 and the soil parameters. The step applies the soil force to the bucket.
@@ -133,7 +133,7 @@ def soil_parameters_view(w):
 
 @compiled
 def init_soil_bed(f, w, soil):
-    """Initialise the terrain with level undisturbed soil at height 0 and an empty bucket.
+    """Initialise the terrain with level undisturbed soil at height 0, an empty bucket and the parameters of one soil.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_soil_bed_parameters`.
@@ -157,16 +157,16 @@ def init_soil_bed(f, w, soil):
 
 @compiled
 def compute_bucket_edge_velocity(f, e, w, rates):
-    """Compute the velocity of the bucket's edge, outwards and up, with the nominal kinematics.
+    """Compute the velocity of the bucket's edge in the plane of the arm with the nominal kinematics.
 
-    Only the damping of the soil uses it, which tolerates the slightly different geometry of a
-    variant.
+    A variant of the machine may have a slightly different geometry. This is acceptable, since the
+    velocity only determines the damping of the soil.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE.
-        w: SimulationView.
-        rates: (2,) written [m/s].
+        e: record of EPISODE_STATE, with the true axis positions.
+        w: SimulationView, with the joint velocities.
+        rates: (2,) written: outward and upward velocity [m/s].
 
     Returns:
         Nothing.
@@ -187,7 +187,7 @@ def compute_bucket_edge_velocity(f, e, w, rates):
 def step_soil_bed(f, e, w):
     """Advance soil profile and bucket contents by one control period, and apply the soil force to the bucket.
 
-    The force acts during the next control period.
+    The force, with the weight of the soil carried, acts during the next control period.
 
     Args:
         f: record of TASK_PARAMETERS.

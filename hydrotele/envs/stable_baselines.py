@@ -20,13 +20,16 @@ from hydrotele.envs.task_setup import TaskSetup
 
 
 def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
-    """Return the observation columns of all references and of the matching measured values.
+    """Return the observation columns of references and of the present measured values of the same quantities.
+
+    References of a later time (`reference_in_..._ms`) are included. A reference without a measured
+    value in the observation is omitted.
 
     Args:
         setup: the task with its options.
 
     Returns:
-        (columns of the fields `reference...`, columns of the measured values).
+        (columns (m,) of fields `reference...`, columns (m,) of the corresponding measured values).
     """
     places = {field.name: number for number, field in enumerate(setup.fields)}
     asked, measured = [], []
@@ -47,6 +50,9 @@ def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, n
 class AgentInterface:
     """Transform observations and actions between n environments and an agent.
 
+    The agent observes the last steps with their reference errors (reference minus measured value).
+    Its action is scaled and, if there is a controller, added to the action of the controller.
+
     Attributes:
         observation_size: number of values in the observation of the agent.
     """
@@ -58,13 +64,15 @@ class AgentInterface:
         controller: Controller | None = None,
         max_fraction: float = 1.0,
     ) -> None:
-        """Define the observation and the action of the agent.
+        """Store the settings and determine the size of the agent's observation.
 
         Args:
             setup: the task with its options.
-            history: number of stacked steps, including the current one.
+            history: number of environment steps in an observation of the agent, including the
+                current one.
             controller: a controller whose actions the agent corrects, None for an agent alone.
-            max_fraction: maximum action of the agent as a fraction of a full action.
+            max_fraction: factor on the actions of the agent, the largest fraction of a full action
+                that it can command or add.
         """
         self._controller, self._max_fraction, self._history = controller, max_fraction, history
         self._reference_columns, self._measured_columns = find_reference_and_measured_columns(setup)
@@ -81,7 +89,10 @@ class AgentInterface:
             self._controller.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the history of the episodes selected by the mask (n,)."""
+        """Restart the history of the episodes selected by the boolean mask (n,), and reset the controller.
+
+        The history is filled with the next observation.
+        """
         self._is_new |= mask
         if self._controller:
             self._controller.reset(mask)
@@ -95,9 +106,10 @@ class AgentInterface:
         return np.concatenate([flat, base], axis=1) if self._controller else flat.copy()
 
     def make_agent_observation(self, observation: np.ndarray) -> np.ndarray:
-        """Return the agent's observation (n, size) for environment observations (n, o).
+        """Append environment observations (n, o) to the history and return the agent's observation (n, size).
 
-        It holds the last steps with their reference errors and, with a controller, the controller's action.
+        It holds the last steps, newest first, with their reference errors and, with a controller,
+        the action that the controller computes now.
         """
         now = self._append_reference_errors(observation)
         self._stacked_steps[:, 1:] = self._stacked_steps[:, :-1]
@@ -109,17 +121,22 @@ class AgentInterface:
         return self._build_agent_observation(self._stacked_steps, self._base_action)
 
     def make_final_agent_observation(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the agent's final observation (m, size) of the `chosen` (m,) episodes.
+        """Return the agent's observation (m, size) of the last step of episodes that ended.
 
-        `observation` (n, o) holds the final observations. The controller is not evaluated, since
-        its state belongs to the next episode already.
+        `observation` (n, o) holds the final observations of the environments, and `chosen` (m,) the
+        indices of the episodes. The history is not changed. The controller is not evaluated, since
+        its state belongs to the next episode already: its last action is used.
         """
         now = self._append_reference_errors(observation[chosen])[:, None]
         past = np.concatenate([now, self._stacked_steps[chosen, :-1]], axis=1)
         return self._build_agent_observation(past, self._base_action[chosen])
 
     def make_environment_action(self, action: np.ndarray) -> np.ndarray:
-        """Return the environment actions (n, a) for the actions of the agent (n, a)."""
+        """Return the environment actions (n, a) for the actions of the agent (n, a).
+
+        The agent's actions are clipped to +-1 and multiplied by the maximum fraction. With a
+        controller, its last action is added and the sum is clipped to +-1.
+        """
         own = self._max_fraction * np.clip(action, -1.0, 1.0)
         return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
 
@@ -144,7 +161,7 @@ class StableVecEnv(_VecEnvBase):
         self, task: str, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
         **options: Any,
     ) -> None:  # fmt: skip
-        """Compile the machines.
+        """Create the environments: compile the machine variants and define the spaces.
 
         Args:
             task: name of the task.
@@ -171,10 +188,10 @@ class StableVecEnv(_VecEnvBase):
         self._return, self._length = np.zeros(num_envs), np.zeros(num_envs, int)
 
     def reset(self) -> np.ndarray:
-        """Start episodes with the seeds given to `seed`, or random ones.
+        """Start an episode in every environment, with the seed given to the method `seed` before, or a random one.
 
         Returns:
-            (n, o) observations.
+            (n, o) observations, those of the agent if there is a `view`.
         """
         drawn = np.random.default_rng().integers(2**62, size=self.num_envs)
         given = zip(self._seeds, drawn, strict=True)
@@ -197,7 +214,7 @@ class StableVecEnv(_VecEnvBase):
         self._pending_actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance by one step; environments whose episode ended start a new one.
+        """Advance all environments by one step; those whose episode ends start a new one in the same step.
 
         Returns:
             (observations (n, o), rewards (n,), dones (n,), infos). The info of an environment whose
@@ -226,7 +243,11 @@ class StableVecEnv(_VecEnvBase):
         return seen, core.reward.astype(np.float32), over, self._infos
 
     def _write_final_infos(self, ended: np.ndarray, last: np.ndarray) -> None:
-        """Write the infos of the episodes that ended: task measures, last observation, return and length."""
+        """Write the infos of the episodes that ended: task measures, last observation, return and length.
+
+        `ended` (m,) are the indices of the environments and `last` (m, ...) the final observations.
+        Return and length of these environments are set to 0 for the next episode.
+        """
         names = [name for name, _ in self.core.setup.task.measures]
         for row, i in enumerate(ended):
             figures = dict(zip(names, self.core.final_measures[i].tolist(), strict=False))
@@ -246,7 +267,7 @@ class StableVecEnv(_VecEnvBase):
         return self.num_envs if indices is None else len(np.atleast_1d(indices))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the attribute of this object once per environment."""
+        """Return a list with the attribute of this object, repeated for each environment in `indices` (None: all)."""
         return [getattr(self, attr_name)] * self._count_indices(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -258,5 +279,5 @@ class StableVecEnv(_VecEnvBase):
         raise InputError(method_name, "cannot be called: the environments are one object")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return False for every environment: wrappers are not supported."""
+        """Return a list with False for each environment in `indices` (None: all): wrappers are not supported."""
         return [False] * self._count_indices(indices)

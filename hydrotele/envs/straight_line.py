@@ -64,7 +64,11 @@ _RATE_BOUND = 1.0  # m/s, rad/s: bound of the reference rates
 
 
 def list_line_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_line_observation` writes: reference pose, rates, preview, errors."""
+    """Return name, unit and bounds of the values that `write_line_observation` writes.
+
+    They are the reference pose, its rates, the reference position 0.1, 0.2 and 0.4 s ahead, and the
+    tracking errors along and across the line.
+    """
     k, far = len(axes), max_reach(machine)
     fields = make_pose_observation_fields(machine, k, "reference")
     fields += [ObservationField(f"reference_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
@@ -81,6 +85,11 @@ def list_line_observation_fields(machine: Machine, axes: tuple[str, ...]) -> lis
 @compiled
 def draw_line_goal(f, e):
     """Draw the goal of an episode: a straight line from the present tip position, with speed and acceleration.
+
+    Direction and length are drawn again until the end has an allowed radius and height, and the
+    path lies in the workspace and does not exceed the rates of the drives (`compute_path_effort`).
+    After 200 draws, length and speed are reduced with every draw. The last of 240 draws is kept in
+    any case.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -126,9 +135,11 @@ def draw_line_goal(f, e):
 def compute_line_travel(g, time):
     """Return the distance that the reference has travelled along the line at a time, and its speed.
 
+    The speed profile is trapezoidal and starts 0.5 s (SETTLE_TIME) after the start of the episode.
+
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
-        time: since the start, scalar [s].
+        time: time since the start of the episode, scalar [s].
 
     Returns:
         (distance [m], speed [m/s]), scalars.
@@ -154,9 +165,10 @@ def compute_line_pose(g, time, pose, rate):
 
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
-        time: since the start, scalar [s].
+        time: time since the start of the episode, scalar [s].
         pose: (MAX_ARM_AXES,) written: r [m], theta [rad], z [m], attitude [rad], 0.
-        rate: (MAX_ARM_AXES,) written, per second.
+        rate: (MAX_ARM_AXES,) written: time derivative of the pose [m/s], [rad/s]; 0 for attitude
+            and head.
 
     Returns:
         Nothing.
@@ -173,17 +185,22 @@ def compute_line_pose(g, time, pose, rate):
 
 @compiled
 def compute_line_errors(g, reference, r, theta, z):
-    """Return the along-track and cross-track errors of the tip.
+    """Return the errors of the tip position along and across the line, relative to the reference position.
+
+    The radial, tangential and vertical distance of the tip from the reference are projected onto
+    the direction of the line.
 
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
-        reference: (MAX_ARM_AXES,) reference pose.
+        reference: (MAX_ARM_AXES,) reference pose: r [m], theta [rad], z [m]; the others are not
+            used.
         r: radius of the tip, scalar [m].
         theta: angle of the tip about the swing axis, modulo 2 pi, scalar [rad].
         z: height of the tip, scalar [m].
 
     Returns:
-        (along, positive ahead [m], across, not negative [m]), scalars.
+        (along-track error [m], positive if the tip is ahead of the reference; cross-track error
+        [m], not negative), scalars.
 
     Source: this module.
     """
@@ -197,7 +214,9 @@ def compute_line_errors(g, reference, r, theta, z):
 
 @compiled
 def write_line_observation(f, e, out, at):
-    """Write the reference pose now and ahead, and the measured tracking errors, to the observation.
+    """Write reference pose and rate, the reference position ahead, and the tracking errors to the observation.
+
+    The errors are those of the tip position that follows from the measured joint positions.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -232,14 +251,18 @@ def write_line_observation(f, e, out, at):
 
 @compiled
 def reward_from_errors(across, along, attitude):
-    """Return 1 minus the weighted errors across [m] and along [m] the line and in attitude [rad], at least -1."""
+    """Return the reward of tracking errors: 1 minus their weighted sum, at least -1.
+
+    The errors are `across` the line [m], `along` the line [m] and in `attitude` [rad], by absolute
+    value. 0.1 m across, 0.2 m along or 0.2 rad cost 1 each.
+    """
     costs = across / CROSS_ERROR_SCALE + abs(along) / ALONG_ERROR_SCALE + abs(attitude) / ATTITUDE_ERROR_SCALE
     return max(-1.0, 1.0 - costs)
 
 
 @compiled
 def compute_line_reward(f, e, w):
-    """Compute the reward of a step from the errors of the true tip position.
+    """Compute the reward of a step from the true errors of tip position and attitude.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -248,7 +271,7 @@ def compute_line_reward(f, e, w):
             error [rad].
 
     Returns:
-        (reward, False), scalars.
+        (reward, False), scalars; False because this task never ends an episode early.
 
     Source: `reward_from_errors`.
     """
@@ -262,7 +285,10 @@ def compute_line_reward(f, e, w):
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw random arm positions with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
+    """Return random start positions, arm axis -> [rad], with the bucket in the air.
+
+    The range is about that of Zhu 1994, Figs 6.45-6.48.
+    """
     return sample_start_positions(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
@@ -293,7 +319,14 @@ STRAIGHT_LINE = Task(
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `StraightLine` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw the line of a new episode), TICK (do nothing), OBSERVE (write
+    the task's values to the observation, from the address `out` on) or REWARD (return the reward
+    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
+    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -1,7 +1,8 @@
 """Definition of a task, the options of a user, and helpers that several tasks use.
 
-`sample_start_positions` draws a start pose that lies well inside the workspace. `compute_path_effort` checks that a
-straight path of the tip stays in the workspace and within the rates of the drives.
+`sample_start_positions` draws a start pose that lies well inside the workspace.
+`compute_path_effort` computes how much a straight path of the tip demands of the drives, and
+whether it stays in the workspace.
 """
 
 import dataclasses
@@ -39,12 +40,13 @@ class Task:
         extra_axes: driven axes in addition to those of the arm.
         action: default kind of actions.
         duration: duration of an episode [s].
-        start: (machine, random generator) -> axis or joint name -> position at the start.
-        fields: (machine, driven axes) -> fields that `write_<kind>_observation` writes.
+        start: function (machine, random generator) -> {axis or joint name: position at the start}.
+        fields: function (machine, driven axes) -> fields that `write_<kind>_observation` writes.
         measures: name and unit of every task measure in `info`.
-        surroundings: (machine, random generator, start) -> objects around the machine.
+        surroundings: function (machine, random generator, start) -> objects around the machine.
         ground: whether there is a hard ground.
-        parameters: (machine, MuJoCo model) -> up to MAX_PARAMETERS values for the native code.
+        parameters: function (machine, MuJoCo model) -> up to MAX_PARAMETERS values for the native
+            code.
         terrain_size: number of terrain values per episode, 0 without terrain.
         swing_locked: whether the action of the swing has no effect.
         written_fields: model fields that the native code writes; they are restored for every episode.
@@ -85,7 +87,8 @@ class Options:
         action: `valve` (valve commands), `joint_rate` (axis rates, tracked by the joint servo) or
             `resolved_motion` (tip rates, converted to axis rates).
         sensors: `ideal`, `real` (the first set of sensors of the machine) or the name of a set.
-        control_rate: environment steps per second [Hz]; the servo runs at 200 Hz or faster.
+        control_rate: environment steps per second [Hz]; the servo runs at the multiple of this rate
+            nearest to 200 Hz, or at this rate if it is higher.
         duration: duration of an episode [s].
         effects: effects added to every episode: mappings with `name`, `location`, `parameters`.
         randomise: effects with a range [low, high] per parameter, drawn for every variant.
@@ -115,13 +118,15 @@ _START_MARGIN = 0.08  # rad, minimum distance to the limits of the joint ranges
 def sample_start_positions(
     machine: Machine, rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]
 ) -> dict[str, float]:
-    """Draw a pose of the tip within bounds and return the positions of the arm axes.
+    """Draw a random pose of the tip within bounds and return the positions of the arm axes.
+
+    The pose is drawn again until the arm can reach it at least 0.08 rad from all joint limits.
 
     Args:
         machine: the machine.
         rng: random generator.
         low: (5,) or, without a head, (4,) lower bounds of r [m], theta [rad], z [m], attitude, head
-            [rad].
+            [rad]; missing elements are 0 in the pose.
         high: upper bounds, likewise.
 
     Returns:
@@ -148,10 +153,11 @@ _PATH_MARGIN = 0.03  # rad, minimum distance of a path to the limits of the join
 
 @compiled
 def compute_path_effort(f, start, change):
-    """Return the maximum drive effort along a straight path of the tip that takes 1 s.
+    """Return the maximum drive effort along a path of the tip that takes 1 s, if it stays in the workspace.
 
-    The effort is the sum of the axis rates, each relative to its rate at full action. The sum
-    matters because all drives use the same pump.
+    The path is straight in the coordinates of the pose and is evaluated at 17 points. The effort is
+    the sum over all arm axes of the axis rate divided by the rate at full action. The sum matters
+    because all drives use the same pump.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -159,8 +165,8 @@ def compute_path_effort(f, start, change):
         change: (MAX_ARM_AXES,) difference between end pose and start pose, same units.
 
     Returns:
-        The maximum effort, scalar [s]; infinite if the path leaves the workspace. Divide it by the
-        duration of the path.
+        The maximum effort, scalar [s]; divide it by the duration of the path. It is infinite if a
+        point is out of reach or closer than 0.03 rad to a joint limit.
 
     Source: `kinematics.task_space`.
     """

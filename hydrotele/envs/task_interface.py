@@ -1,7 +1,7 @@
 """Interface between the environment step and the native code of a task.
 
-It has views of the arrays of one simulation and calls the parts of a task by address, so that every
-task compiles separately.
+It provides views of the arrays of one simulation, and calls the parts of a task by the address of
+its native code, so that every task compiles separately.
 """
 
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
@@ -34,19 +34,21 @@ class SimulationView(NamedTuple):
     """Views of the arrays of one simulation.
 
     Attributes:
-        qpos: (nq,) positions; staggered, see `simulate.record`.
-        qvel: (nv,) velocities.
-        act: (na,) activations.
+        qpos: (nq,) positions, one physics step ahead of the activations, see `simulate.record`.
+        qvel: (nv,) velocities, half a physics step ahead of the activations.
+        act: (na,) activations: spools and pressures.
         ctrl: (k,) applied commands.
         tip: (3,) position of the arm's tip at the time of the activations [m].
         xfrc: (6 nbody,) external forces and torques on bodies, world frame [N], [N m].
         xpos: (3 nbody,) positions of the bodies in the last physics step [m].
-        xipos: (3 nbody,) positions of their centres of mass [m].
+        xipos: (3 nbody,) positions of the centres of mass of the bodies [m].
         xquat: (4 nbody,) quaternions of the bodies.
         xmat: (9 nbody,) rotation matrices of the bodies.
         eq_active: (neq,) uint8, whether an equality constraint is active; part of the state.
-        eq_data: (neq eq_width,) data of the equality constraints; changes last until the end of this call.
-        eq_rows: the same data from the next call on; empty unless the task changes constraints.
+        eq_data: (neq eq_width,) data of the equality constraints in the model; changes last until
+            the end of this call of the native code.
+        eq_rows: (neq eq_width,) data of the constraints that hold from the next call on; empty
+            unless the task changes constraints.
         terrain: (width,) terrain state of the episode; empty for tasks without terrain.
         measures: (MAX_MEASURES,) task measures of this step, for `info`.
         model: address of mjModel.
@@ -133,7 +135,7 @@ def simulation_view(f, m, d, number, argument):
 
 @intrinsic
 def _call_function_at_address(typingctx, function, part, model, data, number, argument, out):
-    """Call a function with the signature TASK_SIGNATURE by its address."""
+    """Call the function at the address `function`, which has the signature TASK_SIGNATURE, and return its result."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)] * 6)
@@ -166,10 +168,10 @@ def observation_view(f, out):
 
     Args:
         f: record of TASK_PARAMETERS.
-        out: address, scalar.
+        out: address of the first value that belongs to the task, scalar.
 
     Returns:
-        (observations,) float32; a task writes only its own fields, from the first element on.
+        (observations,) float32 from this address on; a task writes only as many as it has fields.
     """
     return carray(address_to_pointer(out), (f.observations,), np.float32)
 

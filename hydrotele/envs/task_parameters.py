@@ -1,4 +1,4 @@
-"""Build the parameter record of native code: clocks, machine, servo, sensors, MuJoCo layout.
+"""Build the record of parameters that native code reads: clocks, machine, servo, sensors, MuJoCo layout.
 
 `TASK_CODES` maps the kind of a task to its native code. Each kind is a separate module and compiles
 separately.
@@ -26,22 +26,23 @@ TASK_CODES: dict[str, Callback] = {
     "track": track_trajectory.run_task_part, "line": straight_line.run_task_part, "force": hold_force.run_task_part,
     "reach": reach_feller.run_task_part, "grade": grade.run_task_part, "place": place_log.run_task_part,
 }  # fmt: skip
-"""Kind of task -> its native code, see `world`."""
+"""Kind of task -> its native code, see `task_interface.TASK_SIGNATURE`."""
 
 
 def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
-    """Return the TASK_PARAMETERS record of a task, without the addresses of arrays.
+    """Return the TASK_PARAMETERS record of a task, without the addresses of the arrays that `TaskCore` allocates.
 
     Args:
         setup: the task with its options.
         count: number of environments.
-        autoreset: NEXT_STEP, SAME_STEP or DISABLED.
+        autoreset: when an episode that ended is restarted: NEXT_STEP, SAME_STEP or DISABLED.
 
     Returns:
         () record.
 
     Raises:
-        InputError: the kind of actions or the sensors do not exist.
+        InputError: the kind of actions or the sensors do not exist, or the arm's axes are not the
+            first axes of the machine.
         RuntimeError: the memory layout of MuJoCo's structs is not the expected one.
     """
     facts = np.zeros((), TASK_PARAMETERS)
@@ -116,7 +117,10 @@ def _write_sensor_parameters(facts: np.ndarray, setup: TaskSetup) -> None:
 
 
 def _write_memory_layout(facts: np.ndarray) -> None:
-    """Write the byte offsets of members of mjData and mjModel and the addresses of MuJoCo functions."""
+    """Write the byte offsets of members of mjData and mjModel and the addresses of MuJoCo functions to `facts`.
+
+    MuJoCo's memory layout is verified first.
+    """
     verify_struct_offsets()
     facts["mj_step"] = function_address("mj_step")
     facts["mj_set_state"] = function_address("mj_setState")

@@ -1,7 +1,7 @@
-"""A task with its options.
+"""The setup of an environment: a task combined with the user's options.
 
-Clocks, driven axes, machine variants, observation fields, and the limits of rates and accelerations
-in SI units.
+It holds time steps, driven axes, machine variants, observation fields, and the limits of rates and
+accelerations in SI units.
 """
 
 from typing import NamedTuple
@@ -23,13 +23,13 @@ MAX_POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2, limits of 
 
 
 class Timing(NamedTuple):
-    """Clocks of an environment.
+    """Time steps of an environment and length of its episodes.
 
     Attributes:
         ticks: control periods per environment step.
         substeps: physics steps per control period.
         period: control period [s].
-        horizon: environment steps per episode.
+        horizon: environment steps per episode, after which it is truncated.
     """
 
     ticks: int
@@ -39,18 +39,19 @@ class Timing(NamedTuple):
 
 
 class TaskSetup(NamedTuple):
-    """A task with its options.
+    """A task combined with the user's options, and the machine data that an environment needs.
 
     Attributes:
         task: the task.
         options: the user's options with all defaults filled in.
-        clock: clocks of the environment.
+        clock: time steps of the environment.
         machine: the machine without added or randomised effects, as a controller knows it.
         axes: driven axes in the order of the actions (`valve`, `joint_rate`).
         arm_axes: number of arm axes, which come first in `axes`.
         variants: machines and starts of the episodes.
         fields: fields of the observation.
-        drive_table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drive_geometry`.
+        drive_table: (k, TABLE_POINTS, 3) moment arm and chamber volumes of every axis over its
+            range, from `control.servo.tabulate_drive_geometry`.
     """
 
     task: Task
@@ -65,11 +66,15 @@ class TaskSetup(NamedTuple):
 
 
 def make_timing(options: Options) -> Timing:
-    """Return the clocks for the given options.
+    """Compute control period, physics steps per period and episode length from the options.
+
+    The control rate is the multiple of the environment rate `options.control_rate` that is nearest
+    to 200 Hz; it is the environment rate itself if that is higher.
 
     Raises:
-        InputError: a rate is out of range, or the control period is not a whole number of physics
-            steps.
+        InputError: the environment rate or the physics step is out of range, the control period is
+            not a whole number of physics steps, or the duration is shorter than half an environment
+            step.
     """
     rate, step = options.control_rate, options.timestep
     if not (0.0 < rate <= 1.0e4 and 1.0e-5 <= step <= 5.0e-3):
@@ -91,7 +96,9 @@ def make_timing(options: Options) -> Timing:
 
 
 def full_action_rate(machine: Machine, axis: str) -> float:
-    """Return the rate of an axis at full action, which its drive reaches in its whole range.
+    """Return the rate of an axis that a full action commands.
+
+    The flow of valve and pump suffices for this rate in the whole range of the joint.
 
     Args:
         machine: the machine.
@@ -99,7 +106,8 @@ def full_action_rate(machine: Machine, axis: str) -> float:
 
     Returns:
         The rate [rad/s] or [m/s]: 0.8 times the smaller of rated valve flow and pump flow, divided by the
-        head-side area and the largest moment arm; 0.5 for an axis without a valve.
+        head-side area and by the largest moment arm in the joint range; 0.5 for an axis without a
+        valve.
     """
     facts = machine.axes[axis]
     low, high = machine.joints[facts.joint].range or (-1.0, 1.0)

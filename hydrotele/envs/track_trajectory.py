@@ -45,7 +45,11 @@ _COSINE = _SINE + _HARMONIC_COUNT * MAX_AXES
 
 
 def list_track_observation_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the observation fields that `write_track_observation` writes: references, their rates and previews."""
+    """Return name, unit and bounds of the values that `write_track_observation` writes.
+
+    They are the references of all driven axes, their rates, and the references 0.1, 0.2 and 0.4 s
+    ahead.
+    """
     fields = [make_position_observation_field(machine, name, "reference") for name in axes]
     fields += [make_rate_observation_field(machine, name, "reference_rate") for name in axes]
     for ahead in PREVIEW_TIMES:
@@ -56,11 +60,16 @@ def list_track_observation_fields(machine: Machine, axes: tuple[str, ...]) -> li
 
 @compiled
 def draw_track_references(f, e):
-    """Draw the goal of an episode: random Fourier references within the ranges and rates of the axes.
+    """Draw the goal of an episode: random Fourier references of the driven axes.
+
+    The three harmonics of each axis have random amplitudes and phases, and all axes have the same
+    random period. The amplitudes of an axis are scaled so that its reference stays in the joint
+    range and below a random fraction, 0.3 to 0.7, of its rate at full action.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; the Fourier coefficients are written to `goal`.
+        e: record of EPISODE_STATE; frequency, start positions and Fourier coefficients are written
+            to `goal`.
 
     Returns:
         Nothing.
@@ -93,10 +102,12 @@ def draw_track_references(f, e):
 def compute_axis_reference(g, i, time):
     """Return the reference position of an axis at a time, and its rate.
 
+    The reference is the start position plus a Fourier series, which is faded in over the first 2 s.
+
     Args:
         g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         i: index of the axis, scalar.
-        time: since the start, scalar [s].
+        time: time since the start of the episode, scalar [s].
 
     Returns:
         (position [rad] or [m], rate [rad/s] or [m/s]), scalars.
@@ -124,7 +135,7 @@ def compute_axis_reference(g, i, time):
 
 @compiled
 def write_track_observation(f, e, out, at):
-    """Write the references of all axes, their rates and the references ahead to the observation.
+    """Write the references of all driven axes, their rates and the references ahead to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -147,15 +158,18 @@ def write_track_observation(f, e, out, at):
 
 @compiled
 def compute_track_reward(f, e, w):
-    """Compute the reward: 1 minus 1 for every 0.1 m of tip error, at least -1.
+    """Compute the reward of a step: 1 minus 1 for every 0.1 m of tip error, at least -1.
+
+    The error is the distance of the true tip position from the position that follows from the axis
+    references by the nominal kinematics.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: SimulationView; `measures` receives the distance of the tip from its reference [m].
+        w: SimulationView; `measures` receives the tip error [m].
 
     Returns:
-        (reward, False), scalars.
+        (reward, False), scalars; False because this task never ends an episode early.
 
     Source: this module.
     """
@@ -173,7 +187,14 @@ def compute_track_reward(f, e, w):
 
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
-    """Run one part of the task for one simulation, in native code; see `task_interface.TASK_SIGNATURE`."""
+    """Run one part of the task `TrackTrajectory` for the simulation `number`, in native code.
+
+    `part` is BEGIN (draw the references of a new episode), TICK (do nothing), OBSERVE (write
+    the task's values to the observation, from the address `out` on) or REWARD (return the reward
+    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
+    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    `task_interface.TASK_SIGNATURE`.
+    """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
@@ -186,7 +207,10 @@ def run_task_part(part, m, d, number, argument, out):
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw axis positions uniformly from the middle 40 % of their ranges."""
+    """Return random start positions, axis -> [rad] or [m], uniform in the middle 40 % of the joint range.
+
+    An axis without joint limits counts as one with the range -0.5 to 0.5.
+    """
     places = {}
     for name, axis in machine.axes.items():
         low, high = machine.joints[axis.joint].range or (-0.5, 0.5)

@@ -62,7 +62,9 @@ class Variants:
 
 
 def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
-    """Draw and compile all variants; sets with equal options are cached.
+    """Draw the random machines and starts of all variants and compile their models.
+
+    Variants with equal task and options are cached; the last eight sets are kept.
 
     Args:
         task: the task.
@@ -113,12 +115,15 @@ def _build_variants(task: Task, options: Options, nominal: Machine) -> Variants:
 
 
 def _rename_axes_to_joints(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
-    """Return the positions with axis names replaced by the names of their joints."""
+    """Return positions (name -> value) with the names of axes replaced by the names of their joints."""
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
 
 def _apply_effects(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
-    """Return the machine with the effects of the options, those of `randomise` with random parameters."""
+    """Return the machine with the effects of the options added.
+
+    Effects in `randomise` get parameters drawn uniformly from their ranges.
+    """
     machine = nominal
     for effect in options.effects:
         machine = apply_effect(machine, *_parse_effect(effect), dict(effect.get("parameters", {})))
@@ -152,7 +157,7 @@ def _parse_range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float
 
 
 def _find_differing_fields(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return the values (v, size) of the model fields that differ between plants, and of the fields `also`.
+    """Return name -> values (v, size) of the model fields that differ between v plants or are named in `also`.
 
     A difference in the structure of the model raises InputError.
     """
@@ -187,12 +192,16 @@ def _get_model_field(model: mujoco.MjModel, name: str):
 
 
 def sensor_channels(plant: Plant) -> tuple[str, ...]:
-    """Return the sensor channels in the order of native code: positions, pressures, supply."""
+    """Return the names of the sensor channels in the order of native code: positions, pressures, supply pressure."""
     return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
 
 
 def _make_sensor_error_tables(plant: Plant, machines: list[Machine]):
-    """Return scales, offsets, delays and lag ratios of all sensors of all variants."""
+    """Return scales, offsets, delays and lag ratios of all sensors of all variants, as in `Variants`.
+
+    Raises:
+        InputError: a sensor has a drift, which environments do not simulate.
+    """
     shape, names = (len(machines), MAX_CHANNELS), sensor_channels(plant)
     scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
     lags, c = np.zeros((*shape, 2)), len(names)
@@ -233,8 +242,8 @@ def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
     Returns:
         For every valve, the overlap (0.5 to 2 times its value), flow (0.8 to 1.2) and bandwidth (0.6
         to 1.4); for every drive with a valve, the Coulomb friction (0.5 to 2); for the machine, the
-        bulk modulus (0.6 to 1.2), the command delay (0 to 50 ms) and a payload (0 to 2 % of its
-        mass).
+        bulk modulus (0.6 to 1.2), the command delay (0 to 50 ms) and a payload at the tool
+        (0 to 2 % of the mass of all links).
     """
     found = []
     for name, axis in machine.axes.items():

@@ -39,9 +39,12 @@ precision.
 class Relation(NamedTuple):
     """A linear dependence of one regressor column on other columns, Abdellatif 2008, (10).
 
+    The parameter of the column can be eliminated: its value, times the coefficients, is added to the
+    other parameters.
+
     Attributes:
-        parameter: parameter of the column, such as `inertia_yy.stator_1`.
-        weights: other parameter -> coefficient; empty if the parameter has no effect.
+        parameter: parameter to eliminate, such as `inertia_yy.stator_1`.
+        weights: other parameter -> coefficient; empty if the eliminated parameter has no effect.
     """
 
     parameter: str
@@ -85,11 +88,13 @@ def _build_inertia_tensor(entries: np.ndarray) -> np.ndarray:
 def list_regrouping_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relation]:
     """List the relations between the parameters of the 19 bodies by the rules of section 2.1.
 
-    Prismatic joint: all moments of inertia of the slider are added to the stator. Platform: the
-    slider's mass acts as a point mass in the platform joint, the origin of its frame (Steiner).
-    Revolute joint: mass, first moment along the axis, and equal inertias about x and y represent
-    point masses on the axis. The joint does not move them; they are added to the antecedent body.
-    The base does not move, so that only a ring's inertia about its axis remains.
+    Each leg consists of a ring, a stator and a slider that carries the platform. Prismatic joint: all
+    moments of inertia of the slider are added to the stator. Platform: the slider's mass is added to the
+    platform as a point mass in the platform joint, the origin of the slider's frame (Steiner).
+    Revolute joint: the stator's mass, first moment along the axis, and equal inertias about x and y
+    represent point masses on the axis. The joint does not move them; they are added to the ring. The
+    base does not move, so that of a ring's mass, first moment along its axis and inertias only the
+    inertia about its axis remains.
 
     Args:
         chain: chain of the hexapod; joints of ring, stator and slider are along z of their frames.
@@ -122,30 +127,32 @@ def list_regrouping_relations(chain: Chain, platform_rule: bool = True) -> Itera
 
 
 def _list_parent_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
-    """Return by which parameters of the parent body, with coefficients, a body's parameter is replaced.
+    """Return the parameters of the parent body, with coefficients, that replace a parameter of a body.
 
     Args:
-        matrix: (10, 10) transformation from the body's to the parent's parameters.
-        kind: parameter of the body.
+        matrix: (10, 10) transformation from the body's to the parent's inertial parameters.
+        kind: kind of the body's parameter, such as `mass`.
         body: name of the parent body.
-        *more: further parameters of the body; their sum with `kind` is replaced.
+        *more: further kinds of parameters of the body, which have the same value as `kind`; the
+            coefficients of all these kinds are added.
 
     Returns:
-        Parameter of the parent body -> coefficient.
+        Parameter of the parent body, such as `mass.ring_1` -> coefficient; zeros are left out.
     """
     column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
     return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
 
 
 def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> np.ndarray:
-    """Apply relations one after the other, to express regrouped parameters by all parameters.
+    """Regroup inertial parameters: eliminate one parameter per relation by adding it to others.
 
     Args:
         names: names of the m inertial parameters.
         relations: relations in the order of their application.
 
     Returns:
-        (m, m) coefficients; rows of eliminated parameters are 0.
+        (m, m) coefficients. Row i gives the regrouped parameter i as a linear combination of the m
+        original parameters; rows of eliminated parameters are 0.
 
     Source: Abdellatif 2008, (11).
     """
@@ -166,8 +173,9 @@ def list_printed_combinations(joints: np.ndarray) -> dict[str, dict[str, float]]
         joints: (6, 3) positions of the platform joints r_B in the platform's frame [m].
 
     Returns:
-        Symbol -> parameter -> coefficient. The table prints s_y3 for p5; by I_yy2 + I_zz3 in p1 the
-        strut's axis is z of frame 3, as in the model.
+        Symbol (p1 to p10) -> parameter -> coefficient. For p5 the table prints s_y3, but its p1 contains
+        I_yy2 + I_zz3, by which the strut's axis is z of frame 3. p5 is therefore returned as the
+        slider's first moment along z.
     """
     x, y, z = np.sum(joints**2, axis=0)
     slider = "mass.slider_1"
@@ -210,7 +218,11 @@ def compare_base_parameter_methods(seed: int, changes: Changes) -> Sample:
             of the platform joints in Table 1.
 
     Returns:
-        Numbers of base parameters, and largest differences of coefficients.
+        For three assumptions about the bodies (19 different bodies, equal legs, equal legs with
+        symmetrical bodies): number of inertial `columns`, `rank` by the null space, number of base
+        parameters by the `rules`, and largest `difference` of coefficients between both. Compared with
+        Table 1: numbers of `rigid` and `friction` base parameters, and number of combinations that are
+        the `same`. `values`: largest difference of the model's base parameters from Table 2 [SI].
     """
     defaults = {"declare_symmetry": True, "platform_rule": True, "joint_radius": 1.0}
     settings = merge_settings(defaults, changes)
@@ -253,10 +265,13 @@ def compare_base_parameter_methods(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
-    """Return the singular values of a regressor over the largest one.
+    """Return the singular values of a regressor, divided by the largest one.
+
+    Zero columns are left out, and the others are scaled to unit length. Values below half the machine
+    epsilon are replaced by this bound.
 
     Args:
-        matrix: (n, k, m) regressor; its nonzero columns are scaled to unit length.
+        matrix: (n, k, m) regressor of n samples, k drives and m parameters.
     """
     rows = matrix.reshape(-1, matrix.shape[2])
     length = np.linalg.norm(rows, axis=0)
@@ -266,9 +281,9 @@ def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
 
 
 def _find_inertial_base_parameters(table: Regressor) -> tuple[Identifiability, list[int]]:
-    """Find the base parameters of a regressor without friction.
+    """Find the base parameters of a regressor's inertial columns; friction columns are left out.
 
-    Return their classification, and the indices of the columns of inertial parameters.
+    Return the identifiability of the inertial parameters, and the indices of their columns in `table`.
     """
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
@@ -282,7 +297,10 @@ def _build_shared_parameter_matrix(
 ) -> np.ndarray:
     """Return the matrix (190, m) that computes the parameters of all 19 bodies from m distinct ones.
 
-    The bodies of a group in `equal_bodies` share the parameters of its first body.
+    The entry of a body parameter (row) and a distinct parameter (column) is 1 if the former equals the
+    latter, else 0. `bodies` names the 190 body parameters and `names` the m distinct ones. The bodies of
+    a group in `equal_bodies` share the parameters of the group's first body. Rows of parameters that are
+    not in `names` are 0.
     """
     first = {body: group[0] for group in equal_bodies for body in group}
     sums = np.zeros((len(bodies), len(names)))
@@ -297,11 +315,12 @@ def _build_shared_parameter_matrix(
 def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
     """Return the largest difference of coefficients between regrouping rules and null space.
 
-    The null space may represent the same combinations by other members, so that the rules are first
-    solved for its representatives. The result is infinite if the numbers of combinations differ.
+    The null space may represent the same combinations by other parameters. The combinations by the rules
+    are therefore first solved for the parameters that represent the null space's combinations. The
+    result is infinite if the numbers of combinations differ.
 
     Args:
-        rules: (r, m) combinations by the rules.
+        rules: (r, m) coefficients of r combinations of m parameters by the rules.
         structure: base parameters from the null space.
     """
     if len(rules) != len(structure.base):
@@ -313,7 +332,9 @@ def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> f
 def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[str, float]]) -> dict[str, float]:
     """Count the base parameters, and the combinations that agree with Abdellatif 2008, Table 1.
 
-    A combination agrees if it has the same members and coefficients.
+    A combination agrees if it has the same parameters and coefficients; inertias of drives are ignored.
+    Return the numbers of base parameters of bodies (`rigid`) and of `friction`, and the number of
+    combinations that agree (`same`).
     """
     names, same = [structure.names[k] for k in structure.base], 0
     for symbol, members in printed.items():
@@ -329,7 +350,11 @@ def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[st
 
 
 def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
-    """Compare number, members and coefficients of the base parameters with Abdellatif 2008, Table 1."""
+    """Compare the base parameters from the null space with Abdellatif 2008, Table 1.
+
+    There must be 10 base parameters of rigid bodies and 14 of friction, and all 10 combinations of the
+    table must have the same parameters and coefficients.
+    """
     values = samples[0].values
     return Evaluation(
         (
@@ -347,7 +372,11 @@ def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the regrouping rules give the same base parameters as the null space of the regressor."""
+    """Check that the regrouping rules give the same base parameters as the null space of the regressor.
+
+    Their number and, up to rounding, their coefficients must agree for 19 different bodies, for equal
+    legs, and for equal legs with symmetrical bodies.
+    """
     values, checks = samples[0].values, []
     for stage in _BODY_ASSUMPTIONS:
         rank = values[f"rank, {stage}"]
@@ -361,7 +390,7 @@ def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_parameter_values(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the model's base parameters equal the estimates of Abdellatif 2008, Table 2."""
+    """Check that the model's 24 base parameters equal the estimates of Abdellatif 2008, Table 2, within 1e-9."""
     worst = float(collect_values(samples, "values").max())
     check = check_deterministic_value("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip

@@ -112,7 +112,8 @@ class NormalEquations:
         """Estimate the parameters of t trials by weighted least squares, Abdellatif 2008, (21).
 
         Args:
-            weight: (t, 6, 6) weight of the drives in each trial, or (1, 6, 6) for all trials.
+            weight: (t, 6, 6) inverse of the noise covariance of the drives in each trial [1/N^2], or
+                (1, 6, 6) for all trials.
             correlations: (t, 6, 6, 24) products of regressor columns and forces; see `correlate`.
 
         Returns:
@@ -138,12 +139,13 @@ class TrialEstimates(NamedTuple):
     """Estimates of a series of t trials.
 
     Attributes:
-        value: (t, 24) Gauss-Markov estimates.
-        information: (t, 24, 24) inverse of their covariance P by (28).
-        first_without_excess: (24,) estimate of the first trial with the same noise but stationary friction.
+        value: (t, 24) Gauss-Markov estimates: least squares weighted by the inverse noise covariance.
+        information: (t, 24, 24) inverse of the covariance of `value` by Abdellatif 2008, (28).
+        first_without_excess: (24,) Gauss-Markov estimate of the first trial with the same noise but
+            stationary friction.
         least_squares: (t, 24) estimates with equal weights for all drives.
-        ripple_estimates: (t, 24) estimates with an additional repeatable force, weighted by the residual
-            covariance.
+        ripple_estimates: (t, 24) estimates if the measured forces contain an additional force that
+            repeats in every trial. The weight is the inverse covariance of residuals and noise.
         ripple_information: (24, 24) inverse of the covariance of `ripple_estimates` by (28).
     """
 
@@ -175,8 +177,9 @@ def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
 
     Args:
         seed: seed of the series.
-        settings: friction excess, force noise, processing and number of trials, as in
-            `TRIAL_SETTINGS`.
+        settings: all settings of `TRIAL_SETTINGS`: relative friction excess in the first trial, force
+            noise assumed in the estimate over the actual one, processing of the leg lengths, and
+            number of trials.
 
     Returns:
         The estimates of all trials.
@@ -222,9 +225,9 @@ def compute_trial_statistics(seed: int, changes: Changes) -> Sample:
     Returns:
         Arrays of the t trials. `value` (t, 24) are Gauss-Markov estimates with standard deviations
         `std` (24,); `least_squares` (t, 24) are unweighted. `distance` (t,) is the squared
-        Mahalanobis distance of each estimate from the mean of all trials after the first. The
-        scalar values are distances of the first trial from this mean, and fractions of estimates
-        inside and outside of 95 % intervals.
+        Mahalanobis distance of each trial's 24 estimates from the mean of all trials after the first.
+        The scalar values are squared distances of the first trial from this mean, with and without
+        excess friction, and fractions of estimates inside or outside of 95 % intervals.
     """
     trials = simulate_trials(seed, merge_settings(TRIAL_SETTINGS, changes))
     later = trials.value[1:]
@@ -286,7 +289,7 @@ def _draw_distance(distance: np.ndarray) -> Panel:
 def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
     """Check that at least 90 % of the simulated estimates lie inside the published 95 % intervals.
 
-    These are printed in Abdellatif 2008, Table 2; the first trial of a series does not count.
+    The intervals are printed in Abdellatif 2008, Table 2. The first trial of a series does not count.
     """
     check = check_mean(
         "fraction of the estimates within the printed 95 % intervals", collect_values(samples, "printed"),
@@ -298,7 +301,8 @@ def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
     """Check that the 24 standard deviations of parameters are within a factor of two of the published ones.
 
-    These follow from the intervals that are printed in Abdellatif 2008, Table 2.
+    The simulated standard deviations are averaged over the series of trials. The published ones are a
+    quarter of the widths of the 95 % intervals in Abdellatif 2008, Table 2.
     """
     ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _PRINTED_DEVIATIONS
     low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
@@ -314,10 +318,10 @@ def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_estimates_over_trials(samples: Sequence[Sample]) -> Evaluation:
-    """Check which estimates lie inside their own 95 % intervals about the mean of the series of trials.
+    """Check how many estimates lie inside their own 95 % intervals about the mean of the series of trials.
 
-    At most 10 % of the estimates of later trials may lie outside. More than 10 % of those of the first
-    trial must, because friction is not yet stationary.
+    At most 10 % of the estimates of all trials after the first may lie outside. More than 10 % of the
+    24 estimates of the first trial must lie outside, because friction is not yet stationary.
     """
     return Evaluation((
         check_mean(
@@ -334,8 +338,8 @@ def evaluate_estimates_over_trials(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
     """Check whether more than 10 % of the estimates of the first parameter lie outside their 95 % intervals.
 
-    This parameter p1 is a sum of moments of inertia. The intervals are about the mean of a series
-    of trials, as in Abdellatif 2008, Fig. 8.
+    The parameter p1 is a sum of moments of inertia. The intervals are about the mean of a series of
+    trials, as in Abdellatif 2008, Fig. 8. The first trial of a series does not count.
     """
     check = check_mean(
         "fraction of the estimates of p1 outside their intervals", collect_values(samples, "p1"),
@@ -355,7 +359,9 @@ def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_first_trial(samples: Sequence[Sample]) -> Evaluation:
     """Check that the friction excess at the start moves the first trial out of the 95 % confidence ellipsoid.
 
-    With the same noise but stationary friction, less than half of the first trials may lie outside.
+    The ellipsoid of all 24 parameters is centred at the mean of the other trials of a series. In more
+    than half of the series the first trial must lie outside. With the same noise but stationary
+    friction, less than half of the first trials may lie outside.
     """
     cold, warm = (collect_values(samples, name) for name in ("first distance", "warm first distance"))
     return Evaluation(
@@ -375,7 +381,8 @@ def evaluate_ellipsoid(samples: Sequence[Sample]) -> Evaluation:
     """Compare the fraction of trials within the 95 % confidence ellipsoid with 99 of 99 published trials.
 
     The ellipsoid of the parameter estimates is centred at the mean of the series (Abdellatif 2008,
-    Fig. 9). The first trial of each series does not count.
+    Fig. 9). The first trial of each series does not count. The simulated fraction agrees if it is above
+    the lower limit of the 95 % interval of the fraction that 99 of 99 trials give.
     """
     distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
     published = TRIALS_PER_SERIES - 1
@@ -430,7 +437,11 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
 
 
 def evaluate_least_squares_bias(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether unweighted least squares is biased if the force noise of the drives is cross-correlated."""
+    """Check whether unweighted least squares is biased if the force noise of the drives is cross-correlated.
+
+    The bias is the mean parameter error of all trials after the first. Its Mahalanobis length must be at
+    least one standard deviation of one estimate.
+    """
     truth = load_robot().truth
     value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
     equations = NormalEquations(simulate_excitation().matrix)
@@ -457,15 +468,16 @@ METHODS = {
 
 
 def measure_bias_by_encoder_feedback(seed: int, changes: Changes) -> Sample:
-    """Measure the parameter errors of three methods when controllers feed encoder noise into the forces.
+    """Compute the parameter errors of three estimators when controllers feed encoder noise into the forces.
 
     Args:
         seed: seed of the measurement noise.
-        changes: `length_noise`: factor of the standard deviation of a measured length.
+        changes: `length_noise`: factor of the standard deviation of a measured leg length.
 
     Returns:
         Errors (24,) of the estimates by each method, in published standard deviations. The methods
-        are least squares and Gauss-Markov on unfiltered samples, and Gauss-Markov on mean periods.
+        are least squares and Gauss-Markov (weighted by the inverse noise covariance) on unfiltered
+        samples, and Gauss-Markov on periods that are averaged and filtered in the frequency domain.
     """
     settings = merge_settings({"length_noise": 1.0}, changes)
     own, cycle, periods = load_robot(), simulate_excitation(), 2
@@ -489,7 +501,9 @@ def measure_bias_by_encoder_feedback(seed: int, changes: Changes) -> Sample:
 def evaluate_bias_by_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
     """Check that encoder noise in regressor and forces biases estimates from unfiltered samples.
 
-    Estimates from averaged periods, which are filtered in the frequency domain, must not be biased.
+    The bias is the RMS over 24 parameters of the mean error, in published standard deviations. From
+    unfiltered samples it must be at least 10. From averaged periods, which are filtered in the
+    frequency domain, it must be at most 1.
     """
     checks = []
     for name, words in METHODS.items():

@@ -41,7 +41,8 @@ def simulate_readings(
         extra_errors: (M, N) additional errors, such as those of bent joints [rad].
 
     Returns:
-        The measured poses.
+        The readings of all poses: true angle minus sensor offset plus errors. The joint `pitch` has no
+        sensor and therefore no readings.
     """
     shown = clean.theta - loop.values[:, 0]
     if extra_errors is not None:
@@ -59,8 +60,8 @@ def simulate_readings(
 def sample_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: float = 1.0) -> dict[str, Sweep]:
     """Draw a random back-and-forth motion of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
 
-    The scanned figures do not show the motion over time. The number of cycles is therefore uniform in
-    1 to 3, and the phase of the first pose is uniform.
+    The scanned figures do not show the motion over time. The number of cycles is therefore drawn
+    uniformly from 1 to 3, and the phase of the first pose uniformly from a whole cycle.
 
     Args:
         rng: random generator of cycles and phase.
@@ -68,7 +69,7 @@ def sample_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: f
         pose_fraction: fraction of the published number of poses.
 
     Returns:
-        Link -> sweep.
+        Moving link -> sweep: its range, the angles and drifts of held links, and number of poses.
     """
     return {
         link: sweep._replace(
@@ -86,8 +87,9 @@ def sample_gravity_bends(
 ) -> np.ndarray:  # fmt: skip
     """Draw random angle errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
 
-    N(0, `deviation_deg`) is added to the grapple and yoke angles in the poses in which gravity bends them
-    most. In these poses the calibrator's arm is closest to horizontal.
+    The errors of the grapple and yoke joints are drawn from N(0, `deviation_deg`) in the poses in which
+    gravity bends them most. In these poses the calibrator's arm is closest to horizontal. All other
+    errors are 0.
 
     Args:
         loop: true chain.
@@ -98,7 +100,7 @@ def sample_gravity_bends(
         constant: whether a joint has the same error in all bent poses.
 
     Returns:
-        (M, N) errors [rad].
+        (M, N) errors of all joints in all poses [rad].
     """
     _, turn = frame_after_links(loop, len(loop) - 2, clean.theta)
     slope = np.abs(turn[:, 2, 2])  # of the arm's direction along the vertical
@@ -118,8 +120,9 @@ def compute_retraction_bends(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute angle errors of joints that bend when the stick is retracted (Khoshzaban 1992, p. 69).
 
-    The error increases linearly with the stick angle, from zero at the edge of the bent region to
-    its largest value at the largest angle.
+    The stick is retracted at large stick angles. The bent region holds the fraction `bent_fraction` of
+    the poses with the largest stick angles. The error increases linearly with the stick angle, from zero
+    at the edge of this region to its largest value at the largest angle.
 
     Args:
         loop: true chain.
@@ -128,7 +131,7 @@ def compute_retraction_bends(
         bent_fraction: fraction of the poses in the bent region.
 
     Returns:
-        (errors (M, N) [rad], whether a pose is in the region (M,)).
+        (errors (M, N) [rad], whether a pose is in the bent region (M,)).
     """
     extra, inside = np.zeros_like(clean.theta), np.zeros(len(clean.theta), bool)
     if clean.link == "stick":
@@ -145,14 +148,14 @@ def perturb_loop(
     loop: CalibrationLoop, rng: np.random.Generator, length_deviation: float = 0.03, angle_deviation: float = 1.0,
     sensor_offset: float = 0.0,
 ) -> CalibrationLoop:  # fmt: skip
-    """Draw a true chain with manufacturing and wear errors relative to the nominal chain.
+    """Draw a true chain with random manufacturing and wear errors relative to the nominal chain.
 
-    All errors are normal with mean zero. The calibrator's links are known and get no errors.
+    All errors are normal with mean zero. The calibrator's links are known and get no length errors.
 
     Args:
         loop: nominal chain.
         rng: random generator of the errors.
-        length_deviation: standard deviation of the manipulator's lengths and of the ball position [m].
+        length_deviation: standard deviation of the manipulator's lengths and of the ball's x and z [m].
         angle_deviation: standard deviation of the manipulator's twists and of the sensor offsets of
             grapple, yoke and twist joint [deg].
         sensor_offset: standard deviation of the offsets of the manipulator's sensors [deg].
@@ -185,9 +188,11 @@ def find_true_parameters(
 
     Args:
         loop: true chain.
-        nominal: nominal chain; a stage's ball height p_z is computed with its length d.
+        nominal: nominal chain. A stage's ball height p_z is relative to the nominal length d of the
+            moving link, which the calibration cannot separate from p_z.
         names: (p) names of the parameters.
-        clean: true poses; the true value of a held angle is its mean in its stage.
+        clean: true poses of every stage; the true value of a held link's angle is its mean in the stage
+            in which the link before it moves.
 
     Returns:
         (p,) true values [rad] or [m].
@@ -217,9 +222,9 @@ def compute_tip_errors(
 ) -> tuple[float, float]:
     """Return the RMS distance of the true arm's tip from the `TIP_TARGETS`, before and after calibration.
 
-    Resolved motion converts each target to joint angles with the nominal or the calibrated machine.
-    The true joints are set so that the sensors, corrected by the known offsets, read these angles.
-    MuJoCo then computes the tip position of the true machine.
+    The inverse kinematics of the nominal or the calibrated machine converts each target to joint angles.
+    The true joints are set so that the sensors, corrected by the offsets that this machine knows, read
+    these angles. MuJoCo then computes the tip position of the true machine.
 
     Args:
         nominal: nominal machine.
@@ -228,7 +233,7 @@ def compute_tip_errors(
         stages: readings used for the calibration.
 
     Returns:
-        (with the nominal machine, with the calibrated one) [m].
+        (RMS distance with the nominal machine, RMS distance with the calibrated machine) [m].
     """
     known = build_loop(nominal)
     hierarchical = identify_arm(known, stages)

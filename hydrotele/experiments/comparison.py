@@ -40,8 +40,8 @@ class Panel(NamedTuple):
         x_label: quantity and unit of the horizontal axis.
         log: whether the vertical axis is logarithmic.
         discrete: whether the points are separate measurements, which are drawn as markers.
-        errors: legend -> (n,) differences, drawn on a separate axis below; for curves whose
-            difference is too small to see.
+        errors: legend -> (n,) differences between curves, drawn on a separate axis below, because they
+            may be too small to see in the curves.
         error_label: quantity and unit of the error axis.
     """
 
@@ -95,7 +95,11 @@ class Check(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict: `agrees` if the whole interval is accepted, `differs` if no part of it is, else `undecided`."""
+        """Verdict by comparison of the confidence interval with the accepted range.
+
+        `agrees` if the whole interval is accepted. `differs` if no part of it is, or if the value is not
+        finite. `undecided` otherwise.
+        """
         least, most = self.accepted
         if not np.isfinite(self.value):
             return "differs"
@@ -106,7 +110,7 @@ class Check(NamedTuple):
         return "undecided"
 
     def describe(self) -> str:
-        """Return the quantity, its interval and the published value as text.
+        """Return the quantity, its value, its confidence interval and the published value as text.
 
         >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "", published=11.0).describe()
         'ratio 1.52 [1.31, 1.8] (published 11)'
@@ -157,7 +161,8 @@ class Evaluation(NamedTuple):
     def verdict(self) -> Verdict:
         """Verdict: `differs` if one check differs, `agrees` if all agree, else `undecided`.
 
-        It is `cannot be computed` if a reason for this is given, and `no verdict` without checks.
+        The verdict is `cannot be computed` if `unavailable` gives a reason for this, and `no verdict` if
+        there are no checks.
         """
         if self.unavailable:
             return "cannot be computed"
@@ -197,7 +202,7 @@ class Comparison(NamedTuple):
 
     @property
     def simulated(self) -> str:
-        """Simulated values with their intervals, as text."""
+        """Simulated values with their 95 % intervals, followed by the note of the evaluation, as text."""
         parts = [check.describe() for check in self.evaluation.checks]
         return "; ".join([*parts, *([self.evaluation.note] if self.evaluation.note else [])])
 
@@ -208,11 +213,14 @@ class Comparison(NamedTuple):
 
     @property
     def explanation(self) -> str:
-        """Measured reason for a difference, or the reason why nothing can be computed."""
+        """Reason why the claim cannot be evaluated, or else the explanation of the evaluation.
+
+        The latter is the measured reason for a difference, or the conditions of the agreement.
+        """
         return self.evaluation.unavailable or self.evaluation.explanation
 
     def row(self) -> dict[str, Any]:
-        """Return the row as a dictionary, as printed with `--json`."""
+        """Return the row of the result table as a dictionary, as printed with `--json`, without curves."""
         checks = [
             check._asdict() | {"verdict": check.verdict} for check in self.evaluation.checks
         ]  # fmt: skip
@@ -228,7 +236,7 @@ Changes = Mapping[str, Any]
 
 
 def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Return the default settings of an experiment with changes applied.
+    """Return the default settings of an experiment, with the values of `changes` in place of the defaults.
 
     Raises:
         InputError: a changed key is not a setting.
@@ -281,7 +289,10 @@ class Claim:
     panel_labels: tuple[str, ...] | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
-        """Evaluate the claim with at least one sample; the first sample provides the curves."""
+        """Evaluate the claim with at least one sample, and return its row of the result table.
+
+        The first sample provides the curves: the panels that `panel_labels` names, or all.
+        """
         panels = tuple(panel for panel in samples[0].panels
                        if self.panel_labels is None or panel.label in self.panel_labels)  # fmt: skip
         return Comparison(
@@ -296,7 +307,7 @@ class Experiment:
 
     Attributes:
         name: short name.
-        measure: (seed from 1 on, changes of its settings) -> sample.
+        measure: (seed, changes of the experiment's settings) -> sample. Seeds count repetitions from 1.
         claims: claims evaluated with the samples.
         max_repetitions: upper limit of the number of repetitions, which bounds the run time.
         fixed_repetitions: fixed number of repetitions: 1 if nothing is random, or the number of
@@ -310,7 +321,10 @@ class Experiment:
     fixed_repetitions: int = 0
 
     def repetitions(self, requested: int) -> int:
-        """Return the number of repetitions to run: the fixed number, or the requested one up to the maximum."""
+        """Return the number of repetitions: the fixed number if there is one, else the requested one.
+
+        The requested number is limited to `max_repetitions`.
+        """
         return self.fixed_repetitions or min(requested, self.max_repetitions)
 
 
@@ -355,7 +369,7 @@ def run_series(
 
     Args:
         series: document.
-        seeds: number of repetitions of every experiment; some have a smaller limit.
+        seeds: requested number of repetitions of every experiment; some have a fixed number or a limit.
         jobs: number of processes; the number of cores by default.
         progress: called after every repetition.
 
@@ -371,7 +385,8 @@ def compare_by_repetition_count(
 ) -> dict[int, list[Comparison]]:  # fmt: skip
     """Compare a document with its simulation for several numbers of repetitions.
 
-    The experiments run once with the largest number; smaller numbers use its first seeds.
+    The experiments run once, with the largest number of repetitions. The comparison for a smaller number
+    uses the samples of the first seeds.
 
     Args:
         series: document.
@@ -380,7 +395,7 @@ def compare_by_repetition_count(
         progress: called after every repetition.
 
     Returns:
-        Number of repetitions -> rows.
+        Number of repetitions -> rows of the result table.
     """
     planned = [(one, {}, one.repetitions(max(counts))) for one in series.experiments]
     measured = run_experiments(planned, jobs, progress)
@@ -407,7 +422,7 @@ def run_with_faults(
         progress: called after every repetition.
 
     Returns:
-        The claims, each with a row whose verdict should be `differs`.
+        (claim, its row of the result table with the fault) for each claim; the verdict should be `differs`.
     """
     chosen = [(one, claim) for one in series.experiments for claim in one.claims
               if claim.fault is not None and (not names or claim.name in names)]  # fmt: skip
@@ -423,10 +438,10 @@ def run_experiments(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[list[Sample]]:
-    """Run experiments and return their samples.
+    """Run experiments in several processes and return their samples.
 
     Args:
-        planned: (experiment, changes of its settings, number of repetitions) of each.
+        planned: experiments to run, each as (experiment, changes of its settings, number of repetitions).
         jobs: number of processes; the number of cores by default.
         progress: called after every repetition.
 
@@ -450,11 +465,11 @@ def run_experiments(
 
 
 def run_tasks(tasks: Sequence[tuple[Callable[..., Any], tuple]], jobs: int | None = None) -> Iterator[Any]:
-    """Run functions in several processes and yield their results in order.
+    """Run functions in several processes and yield their results in the order of the tasks.
 
     Args:
-        tasks: functions with their arguments.
-        jobs: number of processes; the number of cores by default.
+        tasks: functions, each with the tuple of its arguments.
+        jobs: number of processes; the number of cores by default. With 1, no process is started.
 
     Yields:
         The result of each function.

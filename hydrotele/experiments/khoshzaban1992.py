@@ -1,8 +1,8 @@
 """Khoshzaban 1992: kinematic and dynamic calibration of a hydraulic arm, repeated in simulation.
 
 Chapter 2 and sections 3.3 to 3.6 are in `khoshzaban_machine`, section 3.7 in `khoshzaban_arm` and
-section 3.8 in `khoshzaban_experiment`. Chapter 4 is in `khoshzaban_dynamics`, and the proposals of
-the thesis are in `khoshzaban_outlook`.
+section 3.8 in `khoshzaban_calibration_claims`. Chapter 4 is in `khoshzaban_dynamics`, and the
+proposals of the thesis are in `khoshzaban_proposals`.
 """
 
 from hydrotele.experiments import (

@@ -88,11 +88,11 @@ _TAPED_DISTANCES = 19  # number of taped distances, p. 65
 
 
 class ArmModel(NamedTuple):
-    """Kinematic parameters of the closed chain, from which the positions of end points are computed.
+    """Kinematic parameters of machine and calibrator, from which the positions of end points are computed.
 
     Attributes:
         values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of each link.
-        ball: (3,) position of the ball joint in frame 0 [m].
+        ball: (3,) position of the calibrator's ball joint in frame 0, that of the chassis [m].
         pitch: angle at which joint 4, which has no sensor, is held [rad].
     """
 
@@ -108,7 +108,7 @@ class Calibration(NamedTuple):
         loop: nominal chain.
         true_loop: true chain.
         true_poses: true poses of every stage.
-        bent_poses: (M,) whether joints bend in each pose of the stick's stage.
+        bent_poses: (M,) whether calibrator joints bend in each pose of the stage in which the stick moves.
         stages: readings of every stage, with the drift of held links.
         kept_stages: readings without the excluded poses.
         fits: results `identified` (all poses) and `reidentified` (kept poses); empty before the
@@ -153,7 +153,10 @@ def simulate_stages(seed: int, settings: Mapping[str, Any], rng: np.random.Gener
 
 
 def identify_with_and_without_bends(calibration: Calibration) -> dict[str, ArmFit]:
-    """Identify the arm from all poses (`identified`) and without the bent poses (`reidentified`)."""
+    """Return the arm identified from all poses (`identified`) and from the kept poses (`reidentified`).
+
+    Kept poses are those that `exclude_bent_poses` leaves. The drift of held links is not modelled.
+    """
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     return {
         name: identify_arm(calibration.loop, [replace(s, drift=None) for s in poses], weighted=False,
@@ -165,8 +168,9 @@ def identify_with_and_without_bends(calibration: Calibration) -> dict[str, ArmFi
 def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
     """Return a stage without the poses in which the readings differ by 1 deg or more from the nominal model.
 
-    A pose is excluded if the closure error of the chain exceeds the displacement of the ball that a
-    yoke rotation of 1 deg causes. Poses in which joint 4 moves, which has no sensor, are all kept.
+    The closure error is the distance between the ball and the end of the chain at the measured angles. A
+    pose is excluded if this error reaches the displacement of the ball that a yoke rotation of 1 deg
+    causes. The stage in which joint 4 moves, which has no sensor, is returned unchanged.
 
     Args:
         loop: nominal chain.
@@ -181,16 +185,19 @@ def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
 
 
 def measure_calibration_errors(seed: int, changes: Changes) -> Sample:
-    """Calibrate a machine with and without the poses in which joints bend under gravity; return the errors of both.
+    """Calibrate a machine with and without the poses in which joints visibly bend; return the errors of both.
 
-    The bending is a simulated fault: it changes the measured angles of the calibrator's joints.
+    The bending is a simulated fault: the measured angles of calibrator joints change if the stick is
+    retracted.
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
         changes: changes of `SETTINGS`: drift, sensor errors, bends and other conditions.
 
     Returns:
-        Errors of parameters, end points, distances and cylinder triangles, and plots of these errors.
+        Errors of identified parameters, of end-point positions, of their distances to the ball, and of
+        the cylinder triangles, for the models `identified` (all poses) and `reidentified` (without bent
+        poses), and curves of these quantities.
     """
     chosen = merge_settings(SETTINGS, changes)
     rng = np.random.default_rng([38, seed])
@@ -215,9 +222,10 @@ def measure_bend_detection(seed: int, changes: Changes) -> Sample:
         changes: changes of `SETTINGS`: drift, sensor errors, bends and other conditions.
 
     Returns:
-        With the equations alone: `overlap` of detected and bent poses (intersection over union),
-        and `blamed` (whether only bent joints are detected). With the nominal model: fraction `left
-        out` of the bent poses that are excluded.
+        With the equations alone: `overlap` of detected and truly bent poses of the stick's stage
+        (intersection over union), and `blamed`: 1 if at least one joint is detected and all detected
+        joints truly bend, else 0. With the nominal model: `left out`, the fraction of the truly bent
+        poses that are excluded.
     """
     chosen = merge_settings(SETTINGS, changes)
     done = simulate_stages(seed, chosen, np.random.default_rng([38, seed]))
@@ -240,9 +248,10 @@ def measure_bend_detection(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit) -> dict[str, float]:
-    """Return the errors of the parameters of one fit [m] or [rad], with their RMS values and iterations.
+    """Return the parameter errors of one fit (identified minus true) [m] or [rad].
 
-    `model` is the prefix of the names, `identified` or `reidentified`.
+    RMS values of alpha, beta, all twists and all lengths, and the solver iterations of each stage are
+    returned as well. `model` is the prefix of all names, `identified` or `reidentified`.
     """
     truth = dict(zip(fit.names, find_true_parameters(calibration.true_loop, calibration.loop, fit.names,
     calibration.true_poses),
@@ -261,10 +270,11 @@ def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit)
 
 
 def _compare_calibrator_readings(calibration: Calibration) -> Sample:
-    """Compare each calibrator reading of the stick's stage with that predicted from the other sensors.
+    """Compare each calibrator reading with that predicted from the other sensors, while the stick moves.
 
-    The prediction uses the nominal model. The RMS differences [deg] are computed for poses inside and
-    outside the bent region.
+    The prediction uses the nominal model. RMS differences [deg] are returned for poses in which joints
+    truly bend (`inside.JOINT`) and for all others (`outside.JOINT`), for joints 5 to 8. Panels show
+    readings and predictions.
     """
     loop, inside = calibration.loop, calibration.bent_poses
     stage = next(one for one in calibration.stages if one.link == "stick")
@@ -296,7 +306,11 @@ def _compare_calibrator_readings(calibration: Calibration) -> Sample:
 
 
 def _compute_nominal_stage_parameters(loop: CalibrationLoop, stage: Poses) -> dict[str, float]:
-    """Return the parameters of one stage that follow from the nominal chain and the manipulator's sensors."""
+    """Return the nominal parameters of one stage, with the ball's distance and height from the moving joint.
+
+    Distance `p_xy` and height `p_z` follow from the nominal chain and the median readings of the held
+    manipulator joints between chassis and moving link.
+    """
     theta = loop.home[None].copy()
     place = loop.links.index(stage.link)
     for k, link in enumerate(loop.links[:place]):
@@ -316,10 +330,10 @@ def _select_arm_model(calibration: Calibration, name: str) -> ArmModel:
 
 
 def _compute_joint_angles(loop: CalibrationLoop, model: ArmModel, stage: Poses) -> np.ndarray:
-    """Return (M, N) joint angles: the readings of all sensors plus their offsets [rad].
+    """Return the joint angles (M, N) of M poses: the readings of all sensors plus their offsets [rad].
 
-    Joint 4 has no sensor; its angle is that of the model. The calibrator's offsets are the model's, the
-    manipulator's are the nominal ones.
+    Joint 4 (pitch) has no sensor; its angle is the constant one of `model`. The offsets of the calibrator's
+    sensors are those of `model`, those of the manipulator's sensors are those of `loop`, the nominal chain.
     """
     theta = np.empty((len(stage), len(loop)))
     for k, link in enumerate(loop.links[: loop.powered_count]):
@@ -335,9 +349,10 @@ def compute_end_position(model: ArmModel, theta: np.ndarray, side: str, links: i
     Args:
         model: kinematic parameters.
         theta: (M, N) joint angles [rad].
-        side: `manipulator`: position in frame 0, computed from the first joints. `calibrator`:
-            position in the last link's frame, computed from the last joints.
-        links: number of links up to the end point.
+        side: joints from which the position is computed. `manipulator`: those between chassis and end
+            point; the position is in frame 0. `calibrator`: those between end point and ball joint; the
+            position is in the frame of the calibrator's last link.
+        links: number of links from the chassis to the end point.
 
     Returns:
         (M, 3) [m].
@@ -349,7 +364,12 @@ def compute_end_position(model: ArmModel, theta: np.ndarray, side: str, links: i
 
 
 def _compare_end_points(calibration: Calibration) -> Sample:
-    """Compute RMS differences of end-point positions between both identified models and the nominal one [m]."""
+    """Compare the end-point positions of both identified models with those of the nominal one.
+
+    RMS distances [m] are returned as `MODEL.position.SIDE.END` for the models `identified` and
+    `reidentified`, for the ends of stick and grapple, computed from the joints of manipulator or
+    calibrator. Panels show the coordinates of the re-identified and the nominal model.
+    """
     nominal, values, panels = _select_arm_model(calibration, "nominal"), {}, []
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     for name, stages in used.items():
@@ -380,8 +400,10 @@ def _compare_end_points(calibration: Calibration) -> Sample:
 def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Generator) -> Sample:
     """Compare distances from end points to the ball, computed by each model, with a simulated tape measure.
 
-    The tape has normal errors with the standard deviation `tape` [m]. The models are the nominal
-    one and those identified with and without the bent poses.
+    The tape has normal errors with the standard deviation `tape` [m]. The models are the nominal one and
+    those identified with and without the bent poses. RMS errors [m] and variances accounted for [%] are
+    returned as `MODEL.SIDE.END.rms` and `.vaf`. For the stick's end from the manipulator's joints, the RMS
+    errors of the poses with distances above and below the median are `far` and `near`.
     """
     pairs = [(one, stage) for one, stage in zip(calibration.true_poses, calibration.stages, strict=True)
              if stage.link in SIMULATED_STAGES]  # fmt: skip
@@ -420,7 +442,11 @@ def _identify_cylinder_triangles(
 ) -> Sample:
     """Identify the triangles of the boom and stick cylinders from measured and from computed joint angles.
 
-    Computed angles follow from the calibrator's readings and the re-identified arm.
+    A triangle consists of a joint and the two pins of its cylinder. Computed angles follow from the
+    calibrator's readings and the re-identified arm. The result contains, for measured (`measured`) and
+    computed (`identified`) angles, the identified minus the nominal parameters, and the RMS error [m]
+    and the variance accounted for [%] of the piston displacement. `AXIS.angle` is the standard deviation
+    of the error of computed angles [deg].
     """
     machine, values, panels = load_machine("calibrator"), {}, []
     transducer, accuracy = settings["transducer"], settings["accuracy"]

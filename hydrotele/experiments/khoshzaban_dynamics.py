@@ -2,8 +2,8 @@
 
 Minor links are the tubes and rods of the cylinders; the reduced model neglects them. The module
 compares forces of the complete and the reduced model (4.4.1) and classifies the identifiability of
-the parameters (4.4.2). Sensor accuracy (4.4.3) is in `khoshzaban_sensors`, and the measured machine
-(4.6) is in `khoshzaban_prediction`.
+the parameters (4.4.2). Sensor accuracy (4.4.3) is in `khoshzaban_sensor_accuracy`, and the measured
+machine (4.6) is in `khoshzaban_prediction`.
 """
 
 from collections.abc import Sequence
@@ -69,8 +69,11 @@ def compare_model_forces(seed: int, changes: Changes) -> Sample:
             centres of mass of the rods lie beyond their pins.
 
     Returns:
-        Factors between the forces with (complete model) and without (reduced model) this inertia,
-        and RMS differences of the forces.
+        Per drive, for the forces with (complete model) and without (reduced model) this inertia:
+        largest `factor` between both, always at least 1, at instants with at least half of the peak
+        force; fraction of instants with a factor of at least two (`twice`), and largest force over the
+        peak force among these (`twice_below`); RMS `difference` [N m] or [N], also over the RMS force
+        (`relative`); peak rate and peak force.
     """
     settings = merge_settings(FORCE_SETTINGS, changes)
     motion = sample_motion(np.random.default_rng(seed))
@@ -125,7 +128,8 @@ def _draw_forces(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> t
 def evaluate_factor_between_forces(samples: Sequence[Sample]) -> Evaluation:
     """Check whether neglecting the cylinders' inertia changes a drive's force by a factor of two or more.
 
-    Only instants with more than half of the peak force count.
+    Only instants with at least half of the drive's peak force count. The factor is the largest of all
+    drives and instants, averaged over repetitions.
     """
     largest = np.max([collect_values(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
     check = check_mean(
@@ -154,7 +158,8 @@ def evaluate_factor_between_forces(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
     """Check that neglecting the cylinders' inertia causes a larger force error at the boom than at the stick.
 
-    The boom's RMS error must also exceed its sensor error.
+    The force error is the RMS difference [N] between the models with and without this inertia. The boom's
+    error must also exceed the accuracy of its force sensors.
     """
     rows = np.stack([collect_values(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
     checks = (
@@ -231,16 +236,17 @@ PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
 
 
 def count_identifiability_classes(classification: Identifiability) -> dict[str, int]:
-    """Count the unidentifiable, linearly identifiable and fully identifiable parameters.
+    """Count the unidentifiable, linearly identifiable and fully identifiable parameters of a regressor.
 
-    Columns without effect and columns that depend linearly on others are deleted and count as
-    unidentifiable. The number of remaining columns is the rank.
+    Regressor columns without effect and columns that depend linearly on others are deleted; their
+    parameters count as unidentifiable. The number of remaining columns is the rank.
 
     Args:
         classification: classification of all parameters.
 
     Returns:
-        Counts `deleted`, `combined` (remaining columns that represent a combination) and `full`.
+        Counts `deleted` (unidentifiable), `combined` (linearly identifiable: remaining columns that
+        represent a combination of parameters) and `full` (fully identifiable).
 
     Source: Khoshzaban 1992, p. 100.
     """
@@ -258,7 +264,10 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
             number of random states.
 
     Returns:
-        Counts of the classes, and the relative singular values on either side of the rank.
+        Per case (`document`: ball joints, `pins`): counts as in `count_identifiability_classes`; the
+        `smallest` nonzero singular value and the `next` one, over the largest; number of parameters
+        `without_effect`; whether these are the first nine of the swing; whether the swing's inertia Izz
+        is identifiable in a combination only.
     """
     settings = merge_settings(COUNT_SETTINGS, changes)
     states = sample_states(settings["states"], seed)
@@ -282,7 +291,10 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_identifiability_counts(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of unidentifiable and identifiable parameters with Khoshzaban 1992, Table 13."""
+    """Check that 31 parameters are unidentifiable, 24 linearly and 27 fully identifiable.
+
+    These counts are those of Khoshzaban 1992, Table 13, for cylinders that end in ball joints.
+    """
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
              "full": "fully identifiable"}  # fmt: skip
@@ -320,7 +332,8 @@ def evaluate_counts_with_pin_joints(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_swing_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Check that nine inertial parameters of the swing have no effect and Izz appears in a combination.
 
-    Khoshzaban 1992, p. 107, states this. Izz is the moment of inertia about the swing axis.
+    No other parameter may be without effect. Khoshzaban 1992, p. 107, states this. Izz is the swing's
+    moment of inertia about the swing axis.
     """
     values = samples[0].values
     return Evaluation(

@@ -34,7 +34,10 @@ _PRINTED_RMS_ERRORS = {("boom", "measured"): 0.0004, ("boom", "identified"): 0.0
 
 
 def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the identified lengths of the cylinder triangles with Khoshzaban 1992, Table 11.
+    """Compare the identified lengths of the boom's and stick's cylinder triangles with Khoshzaban 1992, Table 11.
+
+    Each published deviation from the taped length must lie in the central 95 % of the simulated
+    deviations from the nominal length.
 
     Args:
         samples: samples of `measure_calibration_errors`.
@@ -56,7 +59,7 @@ def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
 
 
 def _describe_angles(samples: Sequence[Sample]) -> str:
-    """Return the errors of joint angles that are computed from the calibrator as text."""
+    """Return a text with the mean standard deviations of the errors of joint angles computed from the calibrator."""
     boom, stick = (collect_values(samples, f"{axis}.angle").mean() for axis in ("boom", "stick"))
     return (
         f"the standard deviations of the errors of computed angles are {boom:.2f} deg (boom) and"
@@ -66,7 +69,10 @@ def _describe_angles(samples: Sequence[Sample]) -> str:
 
 
 def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
-    """Return the mean deviations of the triangles from those measured with a tape, with 95 % intervals, as text."""
+    """Return a text with the mean deviations of triangle parameters from the nominal triangle, with 95 % intervals.
+
+    `kind` is the source of the joint angles, `measured` or `identified` (computed from the calibrator).
+    """
     parts = []
     for axis in ("boom", "stick"):
         for name in PARAMETER_NAMES:
@@ -81,7 +87,9 @@ def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
 def compare_measured_and_computed_angles(samples: Sequence[Sample]) -> Evaluation:
     """Check that measured joint angles give more accurate cylinder triangles than computed angles.
 
-    Khoshzaban 1992, p. 77, states this; computed angles follow from the calibrator's readings.
+    Khoshzaban 1992, p. 77, states this; computed angles follow from the calibrator's readings. For boom and
+    stick, the RMS error of the triangle's lengths with measured angles must be below that with computed
+    angles.
     """
     checks = []
     for axis in ("boom", "stick"):
@@ -107,7 +115,11 @@ def compare_measured_and_computed_angles(samples: Sequence[Sample]) -> Evaluatio
 
 
 def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the RMS errors of computed piston displacements with Khoshzaban 1992, Table 12.
+    """Compare the RMS errors of piston displacements computed from joint angles with Khoshzaban 1992, Table 12.
+
+    The errors of boom and stick must be within a factor of 2 of the published ones, and their ratio
+    (stick over boom) at least half of the published ratio. With computed angles, their ratios to those
+    with measured angles must also be within a factor of 2 of the published ratios.
 
     Args:
         samples: samples of `measure_calibration_errors`.

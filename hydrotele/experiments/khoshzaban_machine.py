@@ -56,10 +56,12 @@ def read_machine_dimensions(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: not used.
-        changes: path in the machine file -> value.
+        changes: path in the machine file, such as `links.boom.mass` -> value.
 
     Returns:
-        Masses, centres of mass, dimensions, mobility and force errors.
+        Masses [kg], centres of mass [m], pin distances and cylinder triangles [m] and [deg], largest
+        difference from the Denavit-Hartenberg parameters of Khoshzaban 1992, Table 2, needed calibrator
+        links, mobility, and force errors due to pressure errors of 25 psi [N] or [N m].
     """
     machine = load_machine("calibrator")
     for path, value in changes.items():
@@ -92,7 +94,10 @@ def read_machine_dimensions(seed: int, changes: Changes) -> Sample:
 
 
 def _measure_pin_distances(machine: Machine) -> dict[str, float]:
-    """Return the distances [m] and angles [deg] between pins of boom and stick, Khoshzaban 1992, Figs 5 and 6."""
+    """Return the distances [m] and angles [deg] between pins of the machine's boom and stick.
+
+    Names such as `boom.L1` are those of Khoshzaban 1992, Figs 5 and 6.
+    """
     boom_axis, stick_axis = machine.axes["boom"].cylinder, machine.axes["stick"].cylinder
     assert boom_axis and stick_axis
     stick_pin = np.array(machine.links["stick"].position)
@@ -137,7 +142,10 @@ def _check_published_value(
 
 
 def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
-    """Compare masses and centres of mass of the model's links with Khoshzaban 1992, Table 1."""
+    """Check that masses and centres of mass of the model's links equal those of Khoshzaban 1992, Table 1.
+
+    Differences may reach half of the last printed digit.
+    """
     values = samples[0].values
     checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
               for n, v in _PUBLISHED_MASSES.items()]  # fmt: skip
@@ -154,7 +162,10 @@ def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_pin_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the pin distances of the model's boom and stick with Khoshzaban 1992, Figs 5 and 6."""
+    """Check that pin distances and angles of the model's boom and stick are those of Khoshzaban 1992, Figs 5 and 6.
+
+    The tolerances are the last printed digits, or the differences between the thesis' own tables.
+    """
     values, digit = samples[0].values, "last printed digit"
     # The model uses L1 = 5.180 m of Table 2; Fig. 5 has 5.190 m, which changes L3 by 9.5 mm.
     wanted = (
@@ -176,7 +187,8 @@ def evaluate_pin_distances(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
     """Compare the dimensions of the model's cylinder triangles with Khoshzaban 1992.
 
-    The values are those of Figs 9 and 10 and Tables 3 and 11.
+    The published values are those of Figs 9 and 10 and Tables 3 and 11. Differences may reach half of the
+    last printed digit.
     """
     checks = [
         _check_published_value(f"{quantity} of the {name}", samples[0].values[f"{quantity}.{name}"], published,
@@ -192,7 +204,11 @@ def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the mobility of the closed chain and the needed calibrator links with Khoshzaban 1992, Eq. 3.5."""
+    """Check the mobility of the closed chain and the number of needed calibrator links, Khoshzaban 1992, Eq. 3.5.
+
+    The machine with grapple must need one link and the excavator three. The mobility with one moving
+    link and four sensed calibrator links must be two.
+    """
     wanted = (("extra links of the machine with grapple", "links_machine", 1.0),
               ("extra links of the excavator", "links_excavator", 3.0),
               ("mobility with one moving and four sensed links", "mobility", 2.0))  # fmt: skip
@@ -203,7 +219,7 @@ def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_dh_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the model's Denavit-Hartenberg parameters with Khoshzaban 1992, Table 2."""
+    """Check that the model's Denavit-Hartenberg parameters equal Khoshzaban 1992, Table 2, within 5e-4 m or deg."""
     return Evaluation((check_deterministic_value(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
@@ -211,7 +227,10 @@ def evaluate_dh_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_drive_force_errors_of_pressure(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the torque and force errors due to pressure errors of 25 psi with Khoshzaban 1992, Eq. 4.61."""
+    """Check the torque and force errors due to pressure errors of 25 psi against Khoshzaban 1992, Eq. 4.61.
+
+    Those of swing, boom and stick may differ by 60 N m or N from the printed ones.
+    """
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
                     "within 60 of the printed value: rounding to hundreds gives up to 50, 10 are reserve",
@@ -223,9 +242,11 @@ def evaluate_drive_force_errors_of_pressure(samples: Sequence[Sample]) -> Evalua
 def find_identifiable_parameters(seed: int, changes: Changes) -> Sample:
     """Find which parameters are identifiable in each calibration stage, and compare them with those published.
 
+    Readings of all stages are simulated with sensor errors but without drift of held links.
+
     Args:
         seed: not used.
-        changes: `wander`: rotation of the grapple during a stage [deg].
+        changes: `wander`: amplitude of the grapple's rotation during a stage [deg].
 
     Returns:
         `different.LINK`: number of parameters that are in only one of two lists, the found one and
@@ -269,7 +290,8 @@ def measure_held_link_drift(seed: int, changes: Changes) -> Sample:
             1992, Table 2, whose closure is checked.
 
     Returns:
-        Largest drift of each held link [deg] and largest closure error `gap` of the chain [m].
+        `HELD while the MOVING moves`: largest deviation of each held link's true angle from its start in
+        each stage [deg]. `gap`: largest closure error of the chain over all stages [m].
     """
     loop = build_loop(load_machine("calibrator"))
     loop = loop.with_values({name: changes[name] for name in loop.parameter_names if name in changes})
@@ -292,7 +314,11 @@ def measure_held_link_drift(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_closure_error(loop: CalibrationLoop, truth) -> float:
-    """Return the largest gap of the closed chain for joint angles simulated in MuJoCo [m]."""
+    """Return the largest coordinate of the closure error of a chain at joint angles simulated in MuJoCo [m].
+
+    The closure error is the vector from the ball to the end of the chain. `truth` is the log of true
+    joint angles.
+    """
     angles = np.stack([truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
     return float(np.abs(closure_error(loop, angles + loop.values[:, 0])[0]).max())
 
@@ -305,7 +331,11 @@ _PUBLISHED_DRIFT = {
 
 
 def evaluate_held_link_drift(samples: Sequence[Sample]) -> Evaluation:
-    """Compare how far held links drift while one link moves with Khoshzaban 1992, Figs 16 to 18."""
+    """Check how far held links drift while one link moves, against Khoshzaban 1992, Figs 16 to 18.
+
+    Boom and stick must drift by 0.2 to 1.6 deg, a factor of 2 around the published 0.4 to 0.8 deg. The
+    swing must drift by at most one step of its 14-bit converter.
+    """
     values = samples[0].values
     checks = [
         check_deterministic_value(f"drift of the {name}", values[name], (0.2, 1.6),
@@ -329,7 +359,7 @@ def evaluate_held_link_drift(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_closure(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the chain of Khoshzaban 1992, Table 2 closes for joint angles of the MuJoCo model."""
+    """Check that the chain of Khoshzaban 1992, Table 2 closes within 0.01 mm for joint angles of the MuJoCo model."""
     return Evaluation((
         check_deterministic_value("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
                     "0.01 mm, much smaller than all errors in this study", unit="um"),

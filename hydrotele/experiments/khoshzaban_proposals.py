@@ -48,7 +48,9 @@ def count_undetermined_parameters(seed: int, changes: Changes) -> Sample:
         changes: `axial_offset`: distance of the two pins along the joint axis [m].
 
     Returns:
-        Number of undetermined parameters per set of sensors, and number of angle sensors `needed`.
+        Number of undetermined parameters with the displacement alone (`length`), with `one_angle` and
+        with `two_angles`, and the smallest number of angle sensors `needed` to determine all (3 if two
+        do not suffice).
     """
     chosen = merge_settings(LINKAGE_SETTINGS, changes)
     machine = load_machine("cat215", "none")
@@ -113,7 +115,7 @@ and whether the noise model is estimated."""
 
 
 def identify_with_flexibility_model(seed: int, changes: Changes) -> Sample:
-    """Identify an arm with bent joints, without and with a noise model of flexible joints.
+    """Identify a simulated arm with bent joints, without and with a noise model of flexible joints.
 
     Args:
         seed: seed of poses, bends and sensor errors.
@@ -122,8 +124,9 @@ def identify_with_flexibility_model(seed: int, changes: Changes) -> Sample:
             estimated.
 
     Returns:
-        Mean squared length errors [m^2] and coverage of the 95 % intervals of both fits, and the
-        estimated flexibility of grapple and yoke at full load [deg].
+        For the fits without (`plain`) and with (`modelled`) noise model: mean squared length error [m^2],
+        and fraction of the 95 % intervals that contain the true parameter (`covered`). `grapple` and
+        `yoke`: estimated standard deviations of these joints' bends at full load [deg].
     """
     chosen = merge_settings(FLEXIBILITY_SETTINGS, changes)
     loop = build_loop(load_machine("calibrator"))
@@ -150,7 +153,11 @@ def identify_with_flexibility_model(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the noise model of flexible joints reduces length errors and gives correct 95 % intervals."""
+    """Check that the noise model of flexible joints reduces length errors and gives correct 95 % intervals.
+
+    The RMS length error must decrease by at least 5 %. At least 85 % of the intervals must contain the
+    true parameter.
+    """
     squares = np.column_stack([collect_values(samples, f"{n}_square") for n in ("modelled", "plain")])
     ratio = check_bootstrapped_statistic(
         "RMS error of the lengths, with over without the noise model", squares,

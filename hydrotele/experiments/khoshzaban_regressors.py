@@ -66,17 +66,17 @@ def make_thesis_regressor_setup(
 
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
-    """Compute the regressor of the drive forces along a motion."""
+    """Compute the regressor of the drive forces of swing, boom and stick along a motion."""
     return setup.compute_regressor(setup.project_motion_on_drives(*motion))
 
 
 def stack_rows(table: Regressor) -> np.ndarray:
-    """Return the regressor of n samples and three drives as a (3 n, m) matrix."""
+    """Return the regressor of n samples, three drives and m parameters as a (3 n, m) matrix, rows by sample."""
     return table.matrix.reshape(-1, len(table.names))
 
 
 def sample_states(count: int, seed: int = 0) -> Motion:
-    """Draw independent random poses, rates and accelerations that excite all parameters.
+    """Draw independent random poses, rates and accelerations of swing, boom and stick, uniformly distributed.
 
     Args:
         count: number n of states.
@@ -147,9 +147,9 @@ class BaseParameters:
     Attributes:
         setup: setup of the regressor.
         classification: identifiability of all parameters.
-        names: (p,) names of the parameters that represent the base parameters.
-        truth: (p,) base parameters of Table 13's machine.
-        sizes: (p,) reference sizes for the errors.
+        names: (p,) names of the parameters whose regressor columns represent the base parameters.
+        truth: (p,) base parameters of the CAT 215 without friction, as in Khoshzaban 1992, Table 13.
+        sizes: (p,) typical magnitudes of the base parameters, with which their errors are compared.
     """
 
     setup: RegressorSetup
@@ -162,7 +162,7 @@ class BaseParameters:
         """Estimate the base parameters by least squares.
 
         Args:
-            motion: measured motion.
+            motion: measured positions, rates and accelerations of n samples.
             forces: (n, 3) measured torque and forces [N m], [N]; or (c, n, 3) for c cases.
 
         Returns:

@@ -34,19 +34,22 @@ ANGLE_ACCURACY = np.deg2rad(0.1)
 def measure_parameter_errors(seed: int, changes: Changes) -> Sample:
     """Compute parameter errors for pressure sensors of 25 psi, of 5 psi, and without errors.
 
-    Uniform errors are added to the simulated angles and forces. Rates and accelerations are exact,
-    because Khoshzaban 1992 adds errors only to resolvers and pressures. Further cases have exact
-    angles (`pressures`) or rates from noisy angles (`differentiated`). The better sensors have the
-    same random errors divided by five; in case `independent` they have independent errors.
+    Base parameters of the complete and the reduced model are estimated by least squares. Uniform errors
+    are added to the simulated angles and forces. Rates and accelerations are exact, because Khoshzaban
+    1992 adds errors only to resolvers and pressures. Further cases have exact angles (`pressures`), or
+    rates and accelerations from noisy angles (`differentiated`). The sensors of 5 psi have the random
+    errors of those of 25 psi divided by five; in case `independent` they have new random errors.
 
     Args:
         seed: seed of the motion and the errors.
-        changes: `noise`: factor of the errors; `residual_noise`: factor of the errors of exact
-            sensors; `pressure_gain`: ratio of both pressure errors; `cylinders_known`: whether only
-            the links of the complete model are identified.
+        changes: `noise`: factor of the errors; `residual_noise`: factor of the errors in the case
+            without errors; `pressure_gain`: ratio of both pressure errors, 5 by default;
+            `cylinders_known`: whether the cylinders of the complete model are known, so that only its
+            links are identified.
 
     Returns:
-        Errors of the base parameters over their reference sizes [1], per model and case.
+        Arrays of the errors of the base parameters over their reference sizes [1], per model and case,
+        and their medians as values.
     """
     settings = merge_settings(NOISE_SETTINGS, changes)
     rng = np.random.default_rng(seed)
@@ -85,7 +88,10 @@ def _add_angle_errors(motion: Motion, errors: np.ndarray) -> Motion:
 
 
 def _stack_parameter_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
-    """Return the (n, p) parameter errors of n repetitions for one model and case."""
+    """Return the (n, p) parameter errors over reference sizes [1] of n repetitions.
+
+    `name` is model and case, such as `complete.25 psi`.
+    """
     return np.array([sample.arrays[name] for sample in samples])
 
 
@@ -93,19 +99,19 @@ def _compute_median_error_ratio(rows: np.ndarray) -> float:
     """Return the median over parameters of the ratio of two errors, averaged geometrically over repetitions.
 
     Args:
-        rows: (n, 2, p) pairs of errors of n repetitions and p parameters.
+        rows: (n, 2, p) errors of n repetitions, numerator and denominator, and p parameters.
     """
     logs = np.mean(np.log(np.maximum(rows, np.finfo(float).tiny)), axis=0)
     return float(np.median(np.exp(logs[0] - logs[1])))
 
 
 def _find_improved_fraction(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
-    """Return the (n,) fraction of parameters whose error decreases by a factor of 10 to 100.
+    """Return the (n,) fraction of parameters whose error decreases by a factor of 10 to 100 in each repetition.
 
     Args:
         samples: n samples of `measure_parameter_errors`.
         model: `complete` or `reduced`.
-        better: case that is compared with sensors of 25 psi.
+        better: case with smaller sensor errors that is compared with case `25 psi`.
     """
     ratio = _stack_parameter_errors(samples, f"{model}.25 psi") / _stack_parameter_errors(samples, f"{model}.{better}")
     return np.mean((ratio >= 10.0) & (ratio <= 100.0), axis=1)
@@ -113,6 +119,10 @@ def _find_improved_fraction(samples: Sequence[Sample], model: str, better: str) 
 
 def _make_improvement_evaluation(model: str, note_suffix: str = ""):
     """Return the evaluation function of the claim that sensors of 5 psi reduce parameter errors 10 to 100 times.
+
+    The reduction is relative to sensors of 25 psi. The function checks the median ratio of the errors
+    over the parameters, and that in one run with independent errors over half of the parameters improve
+    by this factor.
 
     Args:
         model: `complete` or `reduced`.
@@ -155,7 +165,8 @@ def _make_improvement_evaluation(model: str, note_suffix: str = ""):
 def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that with sensors of 25 psi almost all parameters of the complete model have large errors.
 
-    An error above half of the parameter's size is large.
+    An error above half of the parameter's reference size is large. At least 80 % of the base parameters
+    must have large errors.
     """
     errors = _stack_parameter_errors(samples, "complete.25 psi")
     check = check_mean(
@@ -170,7 +181,11 @@ def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
-    """Check that sensor readings without errors give the true parameters to three digits."""
+    """Check that sensor readings without errors give the true base parameters to three digits.
+
+    The largest error of a parameter over its reference size must be at most 5e-4 in the median of the
+    runs, for the complete and the reduced model.
+    """
     checks = tuple(
         check_bootstrapped_statistic(
             f"largest error over size of the {model} model, median of the runs",
@@ -183,7 +198,11 @@ def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_reduced_model_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Check that parameters common to both models have at most half the error in the reduced model."""
+    """Check that parameters common to both models have at most half the error in the reduced model.
+
+    Errors are those with pressure sensors of 25 psi. The criterion is the median over these parameters of
+    the error in the complete over that in the reduced model.
+    """
     names = [find_base_parameters(model).names for model in ("complete", "reduced")]
     if samples[0].arrays["complete.none"].size == len(names[1]):
         names[0] = names[1]
@@ -255,7 +274,15 @@ ACCURACY_SETTINGS = {"accuracy_psi": 25.0}
 
 
 def compute_force_accuracy(seed: int, changes: Changes) -> Sample:
-    """Compute each drive's largest force error from the pressure error times the sum of both piston areas."""
+    """Compute each drive's largest force error: the pressure error times the sum of both piston areas.
+
+    Args:
+        seed: not used.
+        changes: `accuracy_psi`: largest pressure error [psi], 25 by default.
+
+    Returns:
+        Largest error of the swing's torque [N m] and of the forces of boom and stick [N].
+    """
     pressure = 6894.757 * merge_settings(ACCURACY_SETTINGS, changes)["accuracy_psi"]
     machine = load_machine("cat215")
     return Sample({d: pressure * float(np.sum(machine.axes[d].hydraulic_drive.effective_areas)) for d in DRIVES})

@@ -36,14 +36,15 @@ POSE_HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
 
 
 class PublishedParameter(NamedTuple):
-    """One row of the document's Table 2.
+    """One row of Abdellatif 2008, Table 2: an identified parameter, in SI units.
 
     Attributes:
         symbol: printed symbol.
-        column: column of the regressor that represents the combination.
+        column: name of the regressor column that represents this base parameter.
         value: identified value.
         interval: 95 % confidence interval, value -+ 2 standard deviations by (30).
-        prior: a-priori value; 0 for friction, which has none. That of p5 is printed without sign.
+        prior: a-priori value; 0 for friction, which has none. The document prints the prior of p5
+            without its sign.
     """
 
     symbol: str
@@ -54,7 +55,7 @@ class PublishedParameter(NamedTuple):
 
     @property
     def std(self) -> float:
-        """Standard deviation, a quarter of the width of the printed 95 % interval.
+        """Standard deviation of the parameter: a quarter of the width of the printed 95 % interval.
 
         The standard deviations printed in Abdellatif 2008, Table 2, agree with it to rounding
         except for p6 to p9, which are shifted cyclically by one row: p6 has that of p9, p7 that of
@@ -100,8 +101,8 @@ class Robot:
         mechanism: mechanism as loaded by `hydrotele identify --mjcf`, with equal legs and 19
             inertial parameters that are 0 by symmetry.
         base_parameters: base parameters, found from the null space of the regressor.
-        order: (24,) index of every row of Table 2 among the base parameters.
-        truth: (24,) parameter values of the model.
+        order: (24,) position of the parameter of every row of Table 2 in `base_parameters`.
+        truth: (24,) base parameter values of the model, in the order of Table 2.
     """
 
     mechanism: Mechanism
@@ -131,15 +132,15 @@ class Robot:
         return np.concatenate(out)
 
     def compute_leg_lengths(self, motion: np.ndarray) -> np.ndarray:
-        """Return the leg lengths (n, 6) [m] at poses (n, 6)."""
+        """Return the leg lengths (n, 6) [m] at platform poses `motion` (n, 6) [m], [rad]."""
         q = solve_joint_positions(self.setup.chain, self.setup.given_joints, motion)
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
 
 
 def sample_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw 100 random poses, rates and accelerations, each (100, 6), that excite all parameters.
+    """Draw 100 random poses, rates and accelerations of PaLiDA's platform, each (100, 6), with a fixed seed.
 
-    The seed is fixed.
+    Poses lie within the limits of the pose, so that all parameters affect the drive forces.
     """
     rng = np.random.default_rng(0)
     poses = 0.5 * (POSE_LOW + POSE_HIGH)
@@ -185,7 +186,7 @@ def load_excitation() -> Excitation:
 
 
 def make_drive_limits() -> DriveLimits:
-    """Return PaLiDA's limits of pose, stroke, speed and acceleration for the design of motions."""
+    """Return PaLiDA's limits of the pose and of the drives' stroke, speed and acceleration, to design motions."""
     return DriveLimits(
         load_robot().setup,
         POSE_LOW,
@@ -228,14 +229,20 @@ def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
 
 @cache
 def simulate_excitation() -> RepeatedMotion:
-    """Compute leg lengths and drive forces along the designed excitation motion at 1 kHz."""
+    """Compute PaLiDA's noise-free leg lengths, regressor and drive forces in one period of its excitation motion.
+
+    The motion is that of `load_excitation`, sampled at 1 kHz.
+    """
     motion = load_excitation()
     time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
     return simulate_motion(motion.evaluate(time), motion.period)
 
 
 def sample_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Draw random noise (*shape, 6) of the six drive forces [N] with covariance `compute_force_covariance`."""
+    """Draw normal random noise of the six drive forces [N] with covariance `compute_force_covariance`.
+
+    The result has the shape (*shape, 6); all samples are independent.
+    """
     return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(compute_force_covariance()).T
 
 

@@ -17,7 +17,7 @@ _ACCELERATION_TIME = 1.0  # time to reach full speed on a circle [s]
 
 
 def compute_control_gains() -> tuple[float, float]:
-    """Return the proportional gain [N/m] and the damping gain [N s/m] of each drive's controller."""
+    """Return the proportional gain [N/m] and the damping gain [N s/m], equal for the controllers of all drives."""
     turn = 2.0 * np.pi * BANDWIDTH
     return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
 
@@ -31,7 +31,8 @@ def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.nda
         laps: number of laps at full speed.
 
     Returns:
-        (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
+        (3, n, 6) poses, rates and accelerations of the platform at 1 kHz. The tool reaches full speed
+        after 1 s.
     """
     turn = speed / radius
     time = np.arange(0.0, _ACCELERATION_TIME + laps * 2.0 * np.pi / turn, 1.0 / SAMPLE_RATE)
@@ -52,7 +53,7 @@ def plan_square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarr
         laps: number of laps.
 
     Returns:
-        (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
+        (3, n, 6) poses, rates and accelerations of the platform at 1 kHz.
     """
     span = 15.0 / 8.0 * side / speed
     time = np.arange(0.0, 4.0 * laps * span, 1.0 / SAMPLE_RATE)
@@ -74,13 +75,13 @@ def _build_planar_motion(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 class TrackingErrors(NamedTuple):
-    """Tracking errors along a path; n rows at `SAMPLE_RATE`.
+    """Tracking errors of PaLiDA along a path, in n rows at 1 kHz.
 
     Attributes:
         time: (n,) time [s].
         error: (n, 6) reference minus true leg length [m].
-        pose_error: (n, 6) reference minus true pose [m], [rad].
-        warnings: number of MuJoCo warnings.
+        pose_error: (n, 6) reference minus true pose of the platform [m], [rad].
+        warnings: number of MuJoCo warnings during the simulation.
     """
 
     time: np.ndarray
@@ -91,6 +92,9 @@ class TrackingErrors(NamedTuple):
 
 def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> TrackingErrors:
     """Simulate how PaLiDA tracks a path, in MuJoCo with closed chains, friction and encoder noise.
+
+    Each drive has a PID controller of its leg length. The feedforward model adds the drive forces along
+    the reference.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations of the reference.

@@ -13,24 +13,25 @@ def run_shipped_scenario(name: str, overrides: Mapping[str, str] | None = None) 
 
     Args:
         name: name of the scenario.
-        overrides: scenario key -> value.
+        overrides: dotted scenario key -> value as YAML text.
 
     Returns:
-        (scenario, run).
+        (scenario with the changed settings, its simulated run with true and measured logs).
     """
     scenario = load_scenario(name, dict(overrides or {}))
     return scenario, run_scenario(scenario)
 
 
 def read_true_channel(run: Run, channel: str) -> np.ndarray:
-    """Return the (n,) samples of a channel of the simulated truth, or zeros if the run has no such channel."""
+    """Return the (n,) samples of a channel in the log of true values, or zeros if that log has no such channel."""
     return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
 
 
 def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
     """Return the true tip pose over time: r, z [m], theta and attitude [rad], each (n,).
 
-    r and theta are cylindrical coordinates about the swing axis.
+    r and theta are cylindrical coordinates about the swing axis; theta is continuous. The attitude is the
+    sum of the joint angles of boom, stick and tool.
     """
     x, y, z = (read_true_channel(run, f"truth.tip.{c}") for c in "xyz")
     arm = run.plant.machine.arm
@@ -42,7 +43,9 @@ def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
 
 
 def make_random_operator_settings(seed: int) -> dict[str, str]:
-    """Return scenario settings that draw a random simulated operator from its population and set the seed.
+    """Return scenario settings that draw a random simulated operator from the published population.
+
+    The settings are those for `overrides` of `run_shipped_scenario`; they also set the seed of the run.
 
     Args:
         seed: seed of the operator and of the sensor noise.

@@ -22,19 +22,23 @@ _NORMAL_QUANTILE = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 
 
 def collect_values(samples: Sequence[Sample], name: str) -> np.ndarray:
-    """Return the (n,) values of a named result over all samples."""
+    """Return the (n,) values of the scalar result `name`, one per sample."""
     return np.array([sample.values[name] for sample in samples])
 
 
 def check_deterministic_value(
     quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any
 ) -> Check:
-    """Return a check of a quantity without random error: its confidence interval is its value."""
+    """Return a check of a quantity without random error, whose confidence interval is only its value.
+
+    `accepted` is the lowest and the highest value that agree, `reason` the source of this range. `more`
+    holds `unit` and `published` of `Check`.
+    """
     return Check(quantity, float(value), float(value), float(value), accepted, reason, **more)
 
 
 def check_mean(quantity: str, values: np.ndarray, accepted: tuple[float, float], reason: str, **more: Any) -> Check:
-    """Return a check of the mean over repetitions, with Student's confidence interval.
+    """Return a check of the mean over repetitions, with Student's 95 % confidence interval.
 
     Args:
         quantity: name of the quantity.
@@ -69,7 +73,7 @@ def check_fraction(
         **more: `unit` and `published` of `Check`.
 
     Returns:
-        The check, with the Clopper-Pearson interval.
+        The check, with the 95 % Clopper-Pearson interval of the fraction.
     """
     holds = np.asarray(successes, bool)
     found = stats.binomtest(int(holds.sum()), len(holds)).proportion_ci(CONFIDENCE, "exact")
@@ -92,8 +96,8 @@ def check_bootstrapped_statistic(
         **more: `unit` and `published` of `Check`.
 
     Returns:
-        The check, with the percentile interval of 2000 bootstrap resamples; with n = 1 the
-        interval is unbounded.
+        The check, with the 95 % percentile interval of 2000 bootstrap resamples of the repetitions;
+        with n = 1 the interval is unbounded.
     """
     values = np.asarray(values, float)
     value, low, high = float(statistic(values)), -np.inf, np.inf
@@ -119,7 +123,7 @@ def check_published_in_population(
         values: (n,) values of the simulated repetitions, n > 2.
         published: published value of a single experiment.
         unit: unit of the values, for the text.
-        log: whether logarithms are compared, which suits positive values.
+        log: whether logarithms of values and published value are compared, which suits positive values.
 
     Returns:
         The check of d.

@@ -54,7 +54,10 @@ POSE_LABEL = "pose [1]"
 
 
 def _draw_errors(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
-    """Draw errors over poses before and after calibration; draw those after it also on a separate axis."""
+    """Return a panel of errors per pose before and after calibration, in thousandths of their units.
+
+    The errors after calibration are also drawn on a separate axis.
+    """
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
         POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,
@@ -78,13 +81,14 @@ def measure_refined_model(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of the robot and the noise.
-        changes: `document`: whether only the 36 parameters have errors; `noise`: factor of the
-            sensor noise; `stated_noise`: factor of the noise assumed in the fit; `exact_noise`:
-            noise factor of the measurement without noise.
+        changes: `document`: whether only the 36 parameters have errors, or all 54; `noise`: factor of
+            the sensor noise; `stated_noise`: factor of the noise assumed in the fit; `exact_noise`:
+            noise factor of a second measurement, 0 by default.
 
     Returns:
-        RMS position errors at test poses [m], fraction of true errors inside their 95 % intervals, and
-        largest parameter error without noise.
+        RMS position errors at 25 test poses `before` and `after` calibration and if all 54 parameters
+        are calibrated (`with 54`) [m]; `largest` error after it [m]; fraction of true errors `inside`
+        their 95 % intervals; `exact`: largest parameter error from the second measurement [m] or [rad].
     """
     settings = merge_settings({"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes)
     nominal = load_hybrid("iwr")
@@ -155,7 +159,10 @@ def measure_poe_model(seed: int, changes: Changes) -> Sample:
         changes: `noise`: factor of the sensor noise.
 
     Returns:
-        Rank, RMS position errors at measured and test poses [m], and RMS parameter errors.
+        `rank` of the Jacobian. RMS position errors before and after calibration at the measured poses,
+        and after it at `test` poses [m]. `better`: fraction of measured poses with smaller errors after
+        calibration. RMS of the true errors (`assumed PART`) and of identified minus true errors
+        (`missed PART`) of carriage and hexapod [m] or [rad].
     """
     settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
@@ -214,8 +221,10 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
         changes: `noise`: factor of the sensor noise.
 
     Returns:
-        Errors of legs, poses and parameters before and after calibration, and errors of positions that
-        are commanded by inverse kinematics.
+        Before and after calibration: largest `leg` error [m], and RMS errors of `position` [m] and
+        `orientation` [rad] at the measured poses. `test`: RMS position error at test poses after
+        calibration [m]. `reached`: RMS error of true positions that the inverse kinematics of the model
+        commands [m]. RMS true (`assumed`) and remaining (`missed`) parameter errors, and `rank`.
     """
     settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
@@ -256,14 +265,16 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_reached_position_errors(simulated: SimulatedRobot, robot: HybridRobot) -> np.ndarray:
-    """Return the position errors of the true robot when a model's inverse kinematics commands it.
+    """Return the position errors of the true robot when a model's inverse kinematics commands its legs.
+
+    The desired poses are those that the nominal robot reaches with the test commands.
 
     Args:
         simulated: true robot with its M test commands.
         robot: model that computes the commands.
 
     Returns:
-        (M,) [m].
+        (M,) distances of reached and desired positions [m].
     """
     joints, legs = simulated.test_commands
     desired = forward_kinematics(load_hybrid("iwr"), joints, legs)
@@ -306,8 +317,9 @@ def measure_wire_pose_errors(seed: int, changes: Changes) -> Sample:
         changes: `noise`: factor of the wires' noise.
 
     Returns:
-        Largest pose error with exact lengths; with noisy lengths, the squared pose error over its
-        expectation, and median errors of position [m] and orientation [rad].
+        `exact`: largest error of a pose coordinate with exact lengths [m] or [rad]. With noisy lengths:
+        `squares`, the squared pose error weighted by the inverse propagated covariance, over its
+        expectation 6; median errors of `position` [m] and `orientation` [rad].
     """
     settings = merge_settings({"noise": 1.0}, changes)
     robot, wires, rng = load_hybrid("iwr"), default_wires(), np.random.default_rng(seed)

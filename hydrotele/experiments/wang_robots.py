@@ -54,7 +54,8 @@ class SimulatedRobot(NamedTuple):
         errors: (p,) true parameter errors [model.units].
         robot: robot with these errors.
         measurement: measured poses for the calibration.
-        test_commands: carriage positions (M, n) and leg readings (M, 6) of held-out poses.
+        test_commands: carriage joint positions (M, n) and leg readings (M, 6) that command M held-out
+            poses, which are not used in the calibration.
     """
 
     model: ErrorModel
@@ -69,14 +70,14 @@ def simulate_robot(
 ) -> SimulatedRobot:  # fmt: skip
     """Simulate a robot IWR with manufacturing errors and measure its poses with wires.
 
-    The errors have standard deviations of 1 mm and 1 mrad.
+    The manufacturing errors have standard deviations of 1 mm and 1 mrad.
 
     Args:
         seed: seed of errors, poses and noise.
         poses: number of poses for the calibration.
         kind: kind of the error model, D-H or POE.
         refined_only: whether only the 36 parameters of the refined model of Wang 2012 have errors.
-        noise: factor of `SENSOR_NOISE`; 0 for exact measurements.
+        noise: factor of the standard deviations in `SENSOR_NOISE`; 0 for exact measurements.
 
     Returns:
         The robot, its measurement and 25 held-out poses.
@@ -113,7 +114,9 @@ def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) ->
 
 
 def compute_test_pose_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose errors of a calibrated model at the M held-out poses of a simulated robot.
+    """Return the pose errors of a robot model at the M held-out poses of a simulated robot.
+
+    Model and true robot get the same commands of joints and legs.
 
     Args:
         simulated: true robot with its held-out commands.
@@ -132,11 +135,13 @@ def compute_test_pose_errors(simulated: SimulatedRobot, robot: HybridRobot) -> t
 def count_errors_within_intervals(seed: int) -> tuple[int, int]:
     """Count how many true parameter errors lie within the 95 % intervals of a least-squares calibration.
 
+    The 36 parameters of the refined D-H model of a simulated robot IWR are calibrated from 25 poses.
+
     Args:
         seed: seed of the simulated robot.
 
     Returns:
-        (number inside, number of parameters).
+        (number of true errors inside their intervals, number of parameters).
     """
     simulated = simulate_robot(1000 + seed, 25)
     names = refined_model_parameters(simulated.model)
@@ -155,12 +160,16 @@ Drawing = Callable[[Sequence[Sample]], tuple[tuple[Panel, ...], Marginals | None
 
 @dataclass(frozen=True)
 class DrawnClaim(Claim):
-    """A claim whose curves are computed from all samples by the function `draw`."""
+    """A claim whose curves are computed from all samples by the function `draw`.
+
+    Attributes:
+        draw: samples -> (panels, posterior samples or None); None for a claim without curves.
+    """
 
     draw: Drawing | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
-        """Evaluate the claim, and replace its curves by those that `draw` computes."""
+        """Evaluate the claim, and return its row of the result table with the curves that `draw` computes."""
         row = super().compare(samples)
         panels, marginals = self.draw(samples) if self.draw else ((), None)
         return row._replace(panels=panels, marginals=marginals)
@@ -177,7 +186,7 @@ def make_caption_claim(
         item: table or figure with its page.
         quote: caption, in quotation marks.
         note: samples -> text with the simulated values.
-        draw: samples -> (curves, posterior).
+        draw: samples -> (curves, posterior samples to draw or None); None for no curves.
     """
     return DrawnClaim(
         name, item=item, quote=quote, kind="caption", draw=draw,

@@ -48,7 +48,10 @@ _PUBLISHED_FORCE_RATIO = _PUBLISHED_HAND_FORCE / _TARGET_FORCE
 
 
 def find_force_task(scenario: Scenario) -> RegulateForce | TrackForce:
-    """Return the force task of a scenario's operator model, which contains the target force over time."""
+    """Return the operator behaviour of a teleoperation scenario, which contains the target force over time.
+
+    The behaviour must be one that regulates or tracks a force.
+    """
     assert isinstance(scenario.pilot, TeleopPilot)
     behaviour = scenario.pilot.operator
     assert isinstance(behaviour, RegulateForce | TrackForce)
@@ -69,22 +72,24 @@ def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, 
 
 
 def _compute_proportionality_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
-    """Return the RMS deviation of a force from slope times displacement, over the RMS force [1]."""
+    """Return the RMS deviation of `force` from `slope` times the displacement `x`, over the RMS force [1]."""
     return float(np.sqrt(np.mean((force - slope * x) ** 2) / np.mean(force**2)))
 
 
 def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
-    """Simulate an operator who holds 20 kN and then 35 kN and feels only the joystick's stiffness.
+    """Simulate an operator who presses with 20 kN and then 35 kN and feels only the joystick's stiffness.
 
-    The stiffness changes with the contact force.
+    The joystick's stiffness changes with the contact force (stiffness feedback).
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Held forces [N], errors relative to the targets, and deviations of the hand force from
-        proportionality to the handle's displacement.
+        `held_20`, `held_35`: estimated contact force [N], averaged over the last 6 s of each target.
+        `error`, `true_error`: largest relative deviation of the estimated and of the true force from the
+        targets. `line`, `fixed_line`: largest RMS deviation of the hand force from the current stiffness,
+        or from a fitted constant stiffness, times the handle's displacement, over the RMS hand force.
     """
     keys = make_random_operator_settings(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)
     scenario, run = run_shipped_scenario("press_stiffness", keys)
@@ -111,7 +116,7 @@ def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
 
 
 def measure_direct_feedback(ratio: float, seed: int, changes: Changes) -> Sample:
-    """Simulate an operator who holds 25 kN while the contact force is reflected to the hand.
+    """Simulate an operator who presses with 25 kN while the scaled contact force is reflected to the hand.
 
     Args:
         ratio: reflected hand force over contact force [N/N].
@@ -119,8 +124,9 @@ def measure_direct_feedback(ratio: float, seed: int, changes: Changes) -> Sample
         changes: scenario keys.
 
     Returns:
-        Mean forces [N], ripple (standard deviation over mean), and handle displacements [m] in the last
-        40 % of the run.
+        In the last 40 % of the run: mean estimated contact force (`held`) and hand force (`hand`) [N],
+        `ripple` of the true contact force (standard deviation over mean), and mean and largest magnitude
+        of the handle's `displacement` [m]. Also the `ratio` of the run.
     """
     keys = {
         "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TARGET_FORCE}]"
@@ -229,14 +235,16 @@ _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 def search_max_feedback_ratio(number: int, changes: Changes) -> Sample:
     """Search for the largest stable ratio of hand force to contact force in direct feedback, to 20 %.
 
-    Direct feedback reflects the contact force, scaled, to the hand.
+    Direct feedback reflects the contact force, scaled by this ratio, to the hand. Ratios from 4e-5 to
+    8e-4 are searched by bisection.
 
     Args:
         number: number of the condition in `FEEDBACK_CONDITIONS`, from 1 on.
         changes: scenario keys.
 
     Returns:
-        `limit`: largest stable ratio [N/N]; 0 if none is stable, infinite if all are.
+        `limit`: largest stable ratio [N/N]; 0 if the smallest ratio is unstable, infinite if the
+        largest is stable.
     """
     _, keys, hand = FEEDBACK_CONDITIONS[number - 1]
     with tempfile.TemporaryDirectory() as folder:
@@ -257,14 +265,18 @@ def search_max_feedback_ratio(number: int, changes: Changes) -> Sample:
 def _is_direct_feedback_stable(ratio: float, keys: Changes) -> bool:
     """Return whether direct force feedback with this ratio keeps the handle near its centre.
 
-    It must stay within twice its dead band of 1.5 mm in the last 40 % of a run.
+    The handle must stay within twice its dead band of 1.5 mm in the last 40 % of a run. `ratio` is
+    hand force over contact force [N/N], and `keys` are changed scenario keys.
     """
     values = measure_direct_feedback(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
 
 def _write_scaled_joystick(folder: Path, factors: dict[str, float]) -> str:
-    """Write a joystick file with scaled hand parameters and return its path."""
+    """Write a copy of the shipped joystick file with scaled hand impedance to `folder`, and return its path.
+
+    `factors` maps `stiffness` or `damping` of the hand to a factor, which also applies to rotations.
+    """
     source = models_folder() / "joystick" / "joystick.yaml"
     facts = yaml.safe_load(source.read_text(encoding="utf-8"))
     for name, factor in factors.items():
@@ -339,7 +351,8 @@ def measure_tracking(seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        RMS force error of each condition [N].
+        `REFLECTION_DETENT`: RMS difference of the estimated contact force from the target after the
+        contact [N], with `stiffness` or `none` as reflection, and `detent` or `plain` joystick.
     """
     values, panels = {}, []
     for detent in ("true", "false"):

@@ -38,7 +38,7 @@ _LOG_SEEDS = (11, 12)  # seeds of the logs for the fit and for the validation
 
 
 def _perturb_machine(machine: Machine) -> Machine:
-    """Return the machine with masses and dry friction 1.3 times as large."""
+    """Return the machine with link masses and the cylinders' dry friction 1.3 times as large."""
     for name, link in machine.links.items():
         machine = with_value(machine, f"links.{name}.mass", _INITIAL_ERROR_FACTOR * link.mass)
     for name, axis in machine.axes.items():
@@ -56,7 +56,8 @@ def identify_feller_models(seed_offset: int) -> tuple[Machine, GravityModel]:
         seed_offset: number added to the seeds of the logs.
 
     Returns:
-        (machine of the dynamic estimate, parameters of the static estimate).
+        (machine with the identified dynamic parameters, identified static gravity model). Both start from
+        a machine with 1.3 times the masses and dry friction.
     """
     _, slow = run_shipped_scenario("feller_slow_moves", {"seed": str(10 + seed_offset)})
     start = _perturb_machine(slow.plant.machine)
@@ -78,14 +79,17 @@ def identify_feller_models(seed_offset: int) -> tuple[Machine, GravityModel]:
 def measure_false_force(seed: int, changes: Changes) -> Sample:
     """Estimate the endpoint force in free motion, where it is zero, with the static and the dynamic model.
 
-    The feller-buncher is at rest and then follows joint steps or joystick steps.
+    In one run the feller-buncher is at rest and then follows joint steps, in another joystick steps.
+    The estimate is called false force; its magnitude in the radial and vertical direction is evaluated.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        RMS false forces of both models [N] and their ratios.
+        RMS false force of each model (`static`, `dynamic`) in each run and over both runs [N]; of the
+        static model before the joint steps (`at_rest`) [N]; dynamic over static (`share`); static model
+        in joint steps over that at rest (`ratio`).
     """
     machine, gravity = identify_feller_models(0)
     values, panels = {}, []

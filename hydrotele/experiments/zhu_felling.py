@@ -35,16 +35,19 @@ _EVENT_WORDS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
 def simulate_tree_felling(seed: int, changes: Changes) -> Sample:
     """Simulate felling a tree: contact of the head with the stem, sawing, grabbing and laying down.
 
-    `touched` is the time of the first contact of 0.5 kN or more between head and stem; contact with
-    the stump does not count. The scenario's first saw button starts the saw.
+    The scenario's first saw button starts the saw.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Event times [s], contact forces [N], joystick stiffness [N/m], and attitude and swing angle of
-        the head when it lets go of the stem [deg].
+        Event times [s], infinite if the event does not occur: `touched` (first contact of head and stem
+        above 0.5 kN; the stump does not count), `saw` (start), `cut`, `held`, `let_go`. True and
+        estimated contact forces [N]; `rise`, the time from contact until the estimated force exceeds
+        three times that without contact [s]; joystick stiffness along x without and in contact [N/m] and
+        its largest relative change; attitude (`laid`) and swing angle (`aside`) of the head when it lets
+        go of the stem [deg].
     """
     scenario, run = run_shipped_scenario("fell_tree", make_random_operator_settings(seed) | dict(changes))
     pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
@@ -92,7 +95,7 @@ def simulate_tree_felling(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_contact_force(run: Run, object_name: str) -> np.ndarray:
-    """Return the contact force magnitude (n,) between the machine and an object [N]."""
+    """Return the magnitude (n,) of the true contact force between the machine and an object over a run [N]."""
     parts = [read_true_channel(run, f"truth.object_contact.{object_name}_{c}") for c in "xyz"]
     return np.linalg.norm(parts, axis=0)
 
@@ -177,7 +180,11 @@ _SOFT_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffn
 
 
 def _compute_tipping_fraction(run: Run, facts: TipOver) -> np.ndarray:
-    """Return the moment of the vertical contact force as a fraction of that which tips the machine, (n,)."""
+    """Return the moment of the true vertical contact force as a fraction of the moment that tips the machine.
+
+    The result has one value per row of the run's true log, (n,). `facts` holds mass, centre of mass and
+    tipping edge of the machine.
+    """
     pose, force = compute_cylindrical_pose(run), read_true_channel(run, "truth.contact_force.z")
     pairs = zip(pose["r"], force, strict=True)
     return np.array([tipping_ratio(facts, r, f) for r, f in pairs])
@@ -186,15 +193,18 @@ def _compute_tipping_fraction(run: Run, facts: TipOver) -> np.ndarray:
 def simulate_pushing_down(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who pushes the feller-buncher's head down with constant hand force.
 
-    The run is repeated without force reflection, on softer ground, and with a stiff hand that keeps its
-    position instead of its force. The hand force is that which displaces the handle by 3.5 mm.
+    Four conditions are simulated: with stiffness feedback (`with`), without force reflection (`without`),
+    with stiffness feedback on softer ground (`soil`), and with a stiff hand that keeps its position
+    instead of its force (`stiff_hand`). The hand force is that which displaces the handle by 3.5 mm.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Largest fraction of the tipping moment and handle displacements [m] per condition.
+        Per condition: largest fraction of the tipping moment (`CONDITION_share`); largest handle
+        displacement in the last 5 s (`_handle`), and mean displacement in the half second before contact
+        (`_before`) [m].
     """
     cases = {
         "with": {"pilot.reflection": "stiffness"},
@@ -257,14 +267,16 @@ def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
 def simulate_tip_over_protection(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who presses with 60 kN, with and without an added spring in the joystick.
 
-    The spring resists beyond half of the tipping moment. Without it, the force tips the excavator.
+    The spring pushes the handle back if the contact force causes more than half of the tipping moment.
+    Without the spring, 60 kN tip the excavator.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Largest fraction of the tipping moment and handle displacement [m] per condition.
+        With the spring (`spring`) and without it (`bare`): largest fraction of the tipping moment
+        (`CONDITION_share`), and largest handle displacement after 10 s (`CONDITION_handle`) [m].
     """
     values, panels = {}, []
     too_large = {"pilot.operator.target.force": "[6.0e+4]"}

@@ -52,7 +52,7 @@ _HORIZONTAL_QUOTE = (
 
 
 def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
-    """Simulate an operator who moves the tip along a straight line.
+    """Simulate an operator who moves the excavator's tip along a straight line by deflecting one handle axis.
 
     Args:
         direction: `up`, `down`, `out` or `in`.
@@ -60,7 +60,9 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        Travel and deviations from the line [m], their ratio, and rotation of the bucket [deg].
+        `travel` along the line; largest deviation from the line in the arm's plane (`stray`) and
+        `sideways` [m]; larger one of both over the travel (`stray_share`); largest `rotation` of the
+        bucket from its start [deg].
     """
     _, axis, sign, held, start = _LINES[direction]
     push = 0.004 * sign
@@ -127,12 +129,15 @@ _FAST_COORDINATES = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale:
 def measure_overshoot_and_reversals(run: Run) -> tuple[float, int]:
     """Return the largest overshoot of the tip and the number of reversals about the goals of a steering run.
 
+    The operator steers the tip in r and z to a sequence of goals. A reversal is a change of the error
+    from one side of a goal to the other.
+
     Args:
         run: run of the scenario `steer`.
 
     Returns:
-        (largest overshoot over its step [1], number of changes between errors above +3 cm and
-        below -3 cm).
+        (largest overshoot beyond a goal over the step to this goal [1], number of changes between errors
+        above +3 cm and below -3 cm, summed over goals and coordinates).
     """
     pose, time = compute_cylindrical_pose(run), run.truth.time
     overshoot, count = 0.0, 0
@@ -150,15 +155,17 @@ def measure_overshoot_and_reversals(run: Run) -> tuple[float, int]:
 def compare_rate_and_position_control(seed: int, changes: Changes) -> Sample:
     """Simulate an operator who steers the tip to goals by sight, under rate and under position control.
 
-    For the first operators the possible causes of an oscillation are varied: no tremor, a machine
-    five times as fast, and a slower operator.
+    For the first five operators (seeds) the possible causes of an oscillation are varied as well: no
+    tremor (`calm`) and a machine five times as fast (`fast`), both under position control; and an
+    operator with a low crossover frequency under either control (`slow_rate`, `slow_position`).
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Overshoot over the step and number of reversals per condition.
+        Per condition: largest overshoot over the step, and number of reversals about the goals, as by
+        `measure_overshoot_and_reversals`.
     """
     cases = {
         "rate": {"pilot.mode": "rate"},
@@ -243,7 +250,9 @@ def measure_handle_force_curve(detent: str, seed: int, changes: Changes) -> Samp
         changes: scenario keys.
 
     Returns:
-        Stiffness [N/mm], nonlinearity, and force drop at the edge of the dead band [N] per axis.
+        Per axis x and z: stiffness of a line through the centre (`slope`) [N/mm]; RMS deviation from
+        this line over the largest force (`nonlinearity`); stiffness `inside` and `outside` the dead band
+        [N/mm]; force `drop` at the edge of the dead band [N].
     """
     keys = {"pilot.detent": detent} | make_random_operator_settings(seed) | dict(changes)
     _, run = run_shipped_scenario("handle_ramp", keys)
@@ -309,9 +318,9 @@ _MAX_RINGING = 0.02  # amplitude of the remaining oscillation over the step
 
 
 def measure_joint_steps(seed: int, changes: Changes) -> Sample:
-    """Simulate steps of boom, stick and tilt by 0.1 rad and back, and measure angles and pressures.
+    """Simulate steps of the feller-buncher's boom, stick and tilt by 0.1 rad and back; evaluate the response.
 
-    The first repetition is also simulated with half the position gain, which shows whether the
+    The first repetition (seed 1) is also simulated with half the position gain, which shows whether the
     servo causes the oscillation.
 
     Args:
@@ -319,7 +328,9 @@ def measure_joint_steps(seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        Pressure oscillation, overshoot, remaining error and oscillation of the angle per joint.
+        Per joint: head-side pressure from peak to peak (`swing`) and before the step (`level`) [Pa] and
+        their ratio (`pressure`); overshoot, remaining error and amplitude of the remaining oscillation
+        (`ringing`) of the angle, each over the step. With half the gain: overshoot and ringing of the boom.
     """
     values, panels = _simulate_joint_steps(seed, changes)
     if seed == 1:
@@ -405,14 +416,16 @@ _MAX_CROSS_MOTION = 0.1  # motion of another coordinate over the step of that co
 
 
 def measure_coordinate_steps(seed: int, changes: Changes) -> Sample:
-    """Simulate joystick steps in each of the five task coordinates, and measure the pose.
+    """Simulate joystick steps of the feller-buncher in each of the five task coordinates; evaluate the pose.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Step, overshoot, remaining error, and motion of the other coordinates per coordinate.
+        Per coordinate: size of the reference's step [m] or [rad]; overshoot and remaining error of the
+        measured pose over the step; largest motion of another coordinate during the step, over the range
+        of that coordinate's reference (`cross`).
     """
     _, run = run_shipped_scenario("feller_steps", make_random_operator_settings(seed) | dict(changes))
     m, values, panels = run.measured, {}, []

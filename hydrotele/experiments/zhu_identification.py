@@ -42,7 +42,7 @@ _MACHINE_SCENARIOS = {
 
 
 def _compute_scaled_error(found: np.ndarray, true: np.ndarray) -> float:
-    """Return the largest parameter error relative to the largest parameter."""
+    """Return the largest absolute difference of `found` and `true` parameters over the largest true parameter."""
     return float(np.abs(found - true).max() / np.abs(true).max())
 
 
@@ -55,8 +55,10 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        `late`: largest change in the second half, and `error`: largest final error, both relative
-        to the largest parameter; parameters `P1` and interval half-widths `interval P1` [N m].
+        `late`: largest difference from the final estimate in the second half of the samples. `error`:
+        largest difference of the final estimate from the parameters that follow from the machine's
+        masses. Both are relative to the largest parameter. Per parameter P1, P2, ...: estimate (`P1`),
+        half-width of its 95 % interval (`interval P1`), and value by the masses (`true P1`) [N m].
     """
     scenario, samples, _ = _MACHINE_SCENARIOS[name]
     shipped, run = run_shipped_scenario(scenario, {"seed": str(seed)} | dict(changes))
@@ -81,7 +83,7 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
 
 
 def describe_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Return a note with the estimated and true gravity parameters, without a verdict.
+    """Return a note with the estimated and true gravity parameters [kN m], without a verdict.
 
     The available text does not contain the published curves.
     """
@@ -94,9 +96,10 @@ def describe_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the gravity parameters change by less than 1 % in the second half, and err by less than 2 %.
+    """Check that estimated gravity parameters change by less than 1 % in the second half, and err by less than 2 %.
 
-    Both are relative to the largest parameter.
+    The change is the difference from the final estimate in the second half of the samples; the error is
+    that of the final estimate. Both are relative to the largest parameter.
     """
     reason = "converged to 1 % of the largest parameter"
     return Evaluation((
@@ -136,11 +139,12 @@ def measure_outliers(seed: int, changes: Changes) -> Sample:
 
     Args:
         seed: seed of sensor noise and failures.
-        changes: `failures`: number per log; `remove`: whether outliers are removed.
+        changes: `failures`: number of sensor failures per log; `remove`: whether outliers are removed.
 
     Returns:
-        Largest error relative to the largest parameter: `clean` without failures, `spoilt` with
-        failures, `kept` after the removal of outliers. The last two are means over eight samples.
+        Largest parameter error relative to the largest parameter: `clean` without failures, `spoilt` with
+        failures, `kept` with failures after the removal of outliers. `removed`: number of removed
+        samples. The last three are means over eight logs with random failures.
     """
     given = {"failures": 6, "remove": True}
     if unknown := sorted(set(changes) - set(given)):
@@ -204,7 +208,7 @@ def _compute_removed_fraction(rows: np.ndarray) -> float:
 
 
 def evaluate_outlier_removal(samples: Sequence[Sample]) -> Evaluation:
-    """Check that removing outliers eliminates 75 % of the parameter error that sensor failures cause."""
+    """Check that removing outliers eliminates at least 75 % of the parameter error that sensor failures cause."""
     rows = np.column_stack([collect_values(samples, name) for name in ("spoilt", "kept", "clean")])
     return Evaluation(
         (check_bootstrapped_statistic("fraction of the error due to failures that the removal eliminates",

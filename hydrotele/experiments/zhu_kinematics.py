@@ -49,6 +49,8 @@ _MAX_REPETITIONS = 6  # repetitions of a scenario
 def _load_arm(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the geometric parameters (9,) of a machine's arm and the joint ranges (k, 2) [rad].
 
+    The range of the swing is replaced by -pi to pi.
+
     Args:
         name: `excavator` or `feller-buncher`.
     """
@@ -60,7 +62,11 @@ def _load_arm(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_link_transform(turn: float, along: float, length: float, twist: float) -> np.ndarray:
-    """Return the homogeneous transformation (4, 4) of a link with given Denavit-Hartenberg parameters."""
+    """Return the homogeneous transformation (4, 4) of a link with given Denavit-Hartenberg parameters.
+
+    `turn` is the joint angle [rad], `along` the offset d [m], `length` the link length a [m], and `twist`
+    the link twist alpha [rad].
+    """
     ct, st, ca, sa = math.cos(turn), math.sin(turn), math.cos(twist), math.sin(twist)
     return np.array([
         [ct, -st * ca, st * sa, length * ct],
@@ -103,7 +109,10 @@ def measure_inverse_kinematics(changes: Changes) -> Sample:
         changes: `stick`: factor of the stick's length in the closed form.
 
     Returns:
-        Largest position errors [m], and the fraction of poses with the correct reachability.
+        Per machine: largest coordinate of the position difference between forward kinematics and chain
+        (`chain`), and of the position error after inverse kinematics (`back`), infinite if a pose in
+        reach is not solved [m]. `agree`: fraction of poses for which inverse kinematics and a search over
+        the elbow angle agree whether the pose is in reach.
     """
     given = merge_settings({"stick": 1.0}, changes)
     rng, values = np.random.default_rng(23), {}
@@ -158,7 +167,7 @@ def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the closed-form inverse kinematics reaches all poses within the workspace."""
+    """Check that the closed-form inverse kinematics solves all random poses in reach, to 1e-6 m."""
     return Evaluation(tuple(
         check_deterministic_value(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
                     samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
@@ -167,7 +176,10 @@ def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
-    """Check that inverse kinematics finds a solution if and only if the pose is in reach."""
+    """Check that inverse kinematics finds a solution if and only if the pose is in reach.
+
+    Whether a pose is in reach is found by a search over the elbow angle.
+    """
     return Evaluation(tuple(
         check_deterministic_value(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
                     f" form and a search over the elbow agree, {name}",
@@ -186,7 +198,8 @@ def count_inverse_kinematics_solutions(changes: Changes) -> Sample:
         changes: `check`: 0 to count extraneous candidates as solutions.
 
     Returns:
-        Largest numbers of solutions, and mean numbers of extraneous candidates.
+        Over random poses, largest numbers of solutions by the approaches (`first`, `second`), and mean
+        numbers of extraneous candidates (`extra_first`, `extra_second`).
     """
     given = merge_settings({"check": 1.0}, changes)
     g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _load_arm("feller-buncher")
@@ -261,17 +274,18 @@ _METHOD_CHANGES = {
 
 
 def measure_motion_methods(seed: int, changes: Changes) -> Sample:
-    """Simulate the bucket moving up and down twice with inverse kinematics and with the inverse Jacobian.
+    """Simulate the excavator's bucket moving up and down twice, with inverse kinematics and inverse Jacobian.
 
-    Each method is simulated with closed and with open joint loops.
+    Each method is simulated with closed and with open joint loops: `kinematics` and `open` by inverse
+    kinematics, `jacobian` and `rates` by the inverse Jacobian. The radius should stay constant.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys, applied after those of the method.
 
     Returns:
-        Per method, the largest deviation of the radius [m], and the deviation of the reference
-        radius after one and after two cycles [m].
+        Per method, the largest deviation of the true radius from its start (`stray`), and the deviation
+        of the reference radius after one (`once`) and two cycles (`twice`) [m].
     """
     values, radius, time = {}, {}, np.zeros(0)
     for name, keys in _METHOD_CHANGES.items():
@@ -309,7 +323,8 @@ def _collect_pairs(samples: Sequence[Sample], first: str, second: str) -> np.nda
 def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
     """Check that position errors of the inverse Jacobian method accumulate from cycle to cycle.
 
-    The bucket must also deviate at least twice as much as with inverse kinematics.
+    The error of the reference radius must be larger after two cycles than after one. The radius of the
+    bucket must also deviate at least twice as much as with inverse kinematics. Joint loops are closed.
     """
     return Evaluation(
         (
@@ -400,7 +415,11 @@ def simulate_workspace_edge(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_workspace_edge(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the head stops at the edge of the workspace, keeps its height, and leaves it on command."""
+    """Check that the head stops at the edge of the workspace, keeps its height, and leaves the edge on command.
+
+    The head may move 0.058 m beyond the edge and change its height by as much. For more than half of the
+    operators, the references must stop at the edge and leave it within 0.5 s of the reversal.
+    """
     way = "2 % of the travel of 2.9 m, as in the rows of straight lines"
     turned = _REVERSAL_END - _REVERSAL_START
     return Evaluation((

@@ -34,17 +34,17 @@ _DAMPING = 6.1  # 1/s
 
 
 def integrate_rising_damping(changes: Changes) -> Sample:
-    """Integrate a mass on a spring whose damping increases exponentially or slowly.
+    """Integrate the motion of a unit mass on a spring whose damping increases exponentially or slowly.
 
-    The cases are those of Zhu 1994, (4.6) and (4.7). With exponential damping the mass stops before
-    it reaches its rest position.
+    The cases are those of Zhu 1994, (4.6) and (4.7), with the damping 2 + exp(t) and 2 + t/2. With
+    exponential damping the mass stops before it reaches its rest position x = 0.
 
     Args:
         changes: `stiffness`: K [1/s^2].
 
     Returns:
-        `end`: x after 12 s with exponential damping; `slow`: |x| after 100 s with slowly increasing
-        damping.
+        `end`: position x after 12 s with exponential damping; `slow`: |x| after 100 s with slowly
+        increasing damping.
     """
     given = merge_settings({"stiffness": 1.0}, changes)
 
@@ -89,7 +89,7 @@ def measure_worst_switching(changes: Changes) -> Sample:
         changes: `ratio`: damping ratio with K_max.
 
     Returns:
-        `growth`: speed after half a swing over that before.
+        `growth`: speed at the equilibrium after half a swing over that before it [1].
     """
     given = merge_settings({"ratio": 0.02}, changes)
     ratios = np.geomspace(0.01, 1.5, 25)
@@ -102,7 +102,11 @@ def measure_worst_switching(changes: Changes) -> Sample:
 
 
 def evaluate_worst_switching(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the motion of a slightly damped mass grows under the worst switching of its stiffness."""
+    """Check that the motion of a slightly damped mass grows under the worst switching of its stiffness.
+
+    The speed after half a swing must exceed that before it, with a damping ratio of 0.02 and K_max 9
+    times K_min.
+    """
     return Evaluation((
         check_deterministic_value("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
                     " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
@@ -120,7 +124,7 @@ def integrate_varying_stiffness(damping, stiffness, position, speed, step, path)
         position: x at the start, scalar.
         speed: x' at the start, scalar.
         step: length of a time step, scalar [s].
-        path: (n + 1, 2) output: x, x'.
+        path: (n + 1, 2) x and x' at the start and after each step, written.
 
     Returns:
         Nothing.
@@ -144,7 +148,8 @@ def integrate_varying_stiffness(damping, stiffness, position, speed, step, path)
 def sample_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw (count,) random stiffness values [1/s^2], constant between jumps at random times.
 
-    All values are within [K_min, K_max], 1 to 9 1/s^2.
+    Values are K_min (1 1/s^2), K_max (9 1/s^2), or one random value in between. One entry is for each
+    time step of 1 ms.
     """
     jumps = rng.random(count) < _TIME_STEP / 10.0 ** rng.uniform(-1.5, 0.5)
     jumps[0] = True
@@ -166,13 +171,14 @@ def simulate_switched_stiffness(seed: int, changes: Changes) -> Sample:
     """Integrate motions with randomly switched stiffness, to test the stability theorem 4-2 of Zhu 1994.
 
     Args:
-        seed: seed of 20 motions.
+        seed: seed of the start states and stiffnesses of 20 motions.
         changes: `damping`: B [1/s].
 
     Returns:
-        `crossings`: largest number of crossings of the x axis (x' = 0) after the start; `left`:
-        largest distance from the origin after 40 s over that at the start; `outside`: largest
-        distance of paths from the x axis outside the region between those of K_min and K_max.
+        `crossings`: largest number of crossings of the x axis (x' = 0) after the start. `left`: largest
+        distance from the origin of the plane (x, x') after 40 s over that at the start. `outside`:
+        largest distance by which paths that start on the x axis lie outside the region between the paths
+        of constant K_min and K_max.
     """
     given = merge_settings({"damping": _DAMPING}, changes)
     damping, rng, count = given["damping"], np.random.default_rng([seed, 42]), 40_000
@@ -205,7 +211,10 @@ def simulate_switched_stiffness(seed: int, changes: Changes) -> Sample:
 
 
 def _interpolate_speed(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return the speed at given displacements during the first motion towards the origin."""
+    """Return the speed x' at given displacements x during a path's first motion towards the origin.
+
+    `path` is (n, 2) with x and x'; it starts at x > 0. `grid` holds the displacements.
+    """
     turn = np.flatnonzero(np.diff(path[:, 0]) >= 0.0)
     end = int(turn[1]) if len(turn) > 1 and turn[0] == 0 else int(turn[0]) if len(turn) else None
     way = path[: end or len(path)]
@@ -215,7 +224,8 @@ def _interpolate_speed(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
 def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
     """Return how far a path in the (x, x') plane lies outside the paths of constant K_min and K_max.
 
-    All paths are in quadrant IV (x > 0, x' < 0).
+    `bounds` holds these two paths as `K_min` and `K_max`. All paths are in quadrant IV (x > 0, x' < 0). A
+    path that reaches x < 0 counts with its largest |x| there.
     """
     grid = np.linspace(0.02, 0.98, 200)
     speed = _interpolate_speed(path, grid)
@@ -229,7 +239,8 @@ def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) ->
 def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
     """Check that motions with randomly switched stiffness decay, and that the speed changes sign at most once.
 
-    At a change of sign, the path in the plane of position x and speed crosses the x axis.
+    At a change of sign, the path in the plane of position x and speed crosses the x axis. The distance
+    from the origin of this plane must decay to at most 1 % in 40 s.
     """
     return Evaluation((
         check_mean("largest distance from the origin after 40 s over that at the start",
@@ -271,7 +282,9 @@ def measure_published_gains(changes: Changes) -> Sample:
         changes: `damping`: factor of the damping.
 
     Returns:
-        `margin`: largest B^2 - 4 M K_max [(N s/m)^2]; `growth`: largest growth per half swing.
+        `margin`: largest B^2 - 4 M K_max [(N s/m)^2]; positive values satisfy the condition. `growth`:
+        largest speed after half a swing over that before it. Both are over all translational axes, with
+        and without the operator's hand.
     """
     given = merge_settings({"damping": 1.0}, changes)
     joystick = load_joystick()
@@ -289,8 +302,8 @@ def measure_published_gains(changes: Changes) -> Sample:
 def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
     """Check that no translational joystick axis satisfies a sufficient condition of stability, but all are stable.
 
-    The condition is Zhu 1994, (4.14). The motion must decay under the worst switching of the
-    stiffness.
+    The condition is B^2 > 4 M K_max (Zhu 1994, (4.14)), for the published gains. Stable means that the
+    motion decays under the worst switching of the stiffness.
     """
     v = samples[0].values
     return Evaluation((
@@ -305,10 +318,12 @@ def compute_joystick_resolution(changes: Changes) -> Sample:
     """Compute the condition number of the levitated joystick's coil matrix and its pose resolution.
 
     Args:
-        changes: `step`: factor of the photodiodes' step; `radius`: lever that scales torques [m].
+        changes: `step`: factor of the photodiodes' step; `radius`: factor of the torques, which are
+            divided by the radius of the coils.
 
     Returns:
-        Condition number, and standard deviations of position [um] and rotation [deg].
+        `condition`: condition number of the matrix from coil currents to forces and scaled torques.
+        Largest standard deviations of position (`translation`) [um] and `rotation` [deg].
     """
     given = merge_settings({"step": 1.0, "radius": 1.0}, changes)
     joystick = load_joystick()
@@ -324,7 +339,10 @@ def compute_joystick_resolution(changes: Changes) -> Sample:
 
 
 def evaluate_coil_condition_number(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the matrix from coil currents to forces and torques is well conditioned (below 10)."""
+    """Check that the condition number of the matrix from coil currents to forces and torques is below 10.
+
+    Torques are divided by the radius of the coils.
+    """
     return Evaluation((
         check_deterministic_value("condition number of M, torques divided by the coils' radius",
                     samples[0].values["condition"], (1.0, 10.0),
@@ -333,7 +351,10 @@ def evaluate_coil_condition_number(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_pose_resolution(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the joystick resolves about 1 um and 0.001 deg with photodiodes of 1 um steps."""
+    """Check that the standard deviations of the joystick's measured pose are at most 1 um and 0.001 deg.
+
+    The photodiodes have steps of 1 um.
+    """
     v, reason = samples[0].values, "approximately: up to the printed figure"
     return Evaluation((
         check_deterministic_value("standard deviation of the position", v["translation"], (0.0, 1.0), reason,

@@ -22,7 +22,7 @@ _KHOSHZABAN_TOLERANCE = 1.0  # tolerance [mm]: Khoshzaban 1992 prints the same p
 
 
 def _compute_distance(a: Sequence[float], b: Sequence[float], *axes: int) -> float:
-    """Return the distance [mm] of two points [m] in the plane or space of the given axes (0, 1, 2)."""
+    """Return the distance [mm] of two points a and b [m], of which only the coordinates `axes` (0, 1, 2) count."""
     return 1e3 * math.dist([a[k] for k in axes], [b[k] for k in axes])
 
 
@@ -63,10 +63,10 @@ def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: floa
 
     Args:
         machine: machine.
-        name: axis.
-        a: printed distance of one pin [mm].
+        name: name of the axis.
+        a: printed distance of one pin of the cylinder from the joint [mm].
         b: printed distance of the other pin [mm].
-        half: half of the last printed digit [mm].
+        half: half of the last printed digit, which is the tolerance [mm].
 
     Returns:
         Name -> (value of the model, printed value, half of its last digit).
@@ -93,7 +93,7 @@ def _compare_four_bar(machine: Machine, name: str, closure: str, printed: Sequen
     Args:
         machine: machine.
         name: axis.
-        closure: closure of the linkage.
+        closure: name of the machine's closure that closes the linkage.
         printed: printed r1, r2, r3, r4 [mm], gamma, alpha [rad], L [mm].
 
     Returns:
@@ -182,10 +182,10 @@ def _compare_joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) ->
 
 
 def _compare_force_limits(name: str, force: float) -> TableEntries:
-    """Pair the model's largest reflected forces with those printed in Zhu 1994.
+    """Pair the joystick's largest reflected contact forces with those printed in Zhu 1994.
 
-    The latter are `force` [kN] in translation and 40 kN m in rotation. The result is axis -> (value
-    of the model, printed value, half of its last digit).
+    The printed ones are `force` [kN] in translation and 40 kN m in rotation. `name` is the name of the
+    joystick's gains. The result is axis -> (value of the model, printed value, half of its last digit).
     """
     return {
         axis: (gains.force_limit / 1e3, force if len(axis) == 1 else 40.0, 0.5)
@@ -241,8 +241,9 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
         changes: `factor`: factor of the model parameters, 1 by default.
 
     Returns:
-        For each compared table of the thesis: number of entries, number of entries that differ, largest
-        relative difference. Differing rotational dampings `Kd` are also counted on their own.
+        For each compared table of the thesis: number of `entries`; number of entries that `differ` by more
+        than their tolerance, mostly half of the last printed digit; `largest` relative difference; and
+        number of differing rotational dampings Kd (`damping`).
 
     Raises:
         InputError: `changes` has another key.

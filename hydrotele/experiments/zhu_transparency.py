@@ -47,7 +47,7 @@ from hydrotele.teleop.two_port import Impedance, TwoPort, hybrid_matrix, scatter
 
 
 def sample_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
-    """Draw a random passive impedance whose mass, damping and stiffness are 0.1 to 10 times those of another."""
+    """Draw a random passive impedance whose mass, damping and stiffness are 0.1 to 10 times those of `base`."""
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     return Impedance(*(factors * (base.mass, base.damping, base.stiffness)))
 
@@ -59,8 +59,10 @@ def measure_transparency(changes: Changes) -> Sample:
         changes: `mass_error`: relative error of the slave's mass; `delay`: delay each way [s].
 
     Returns:
-        Largest error of the hybrid matrix, largest scattering norm, slowest pole of the position error
-        [1/s], and the stable fraction of loops with random hands and tasks.
+        `matrix`: largest difference of the hybrid matrix from [[0, 1], [-1, 0]], relative to 30 N s/m.
+        `norm`: largest scattering norm. `slowest`: largest real part of the poles of the position error
+        between slave and master [1/s]. `stable`: stable fraction of 100 loops with random hands and
+        tasks.
     """
     given = merge_settings({"mass_error": 0.0, "delay": 0.0}, changes)
     case = load_shipped_case().with_delay(given["delay"])
@@ -89,7 +91,8 @@ def measure_transparency(changes: Changes) -> Sample:
 def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
     """Check that a four-channel teleoperator transmits force and velocity unchanged (Zhu 1994, p. 39).
 
-    Its hybrid matrix must be [[0, 1], [-1, 0]], and the position error of the slave must decay.
+    Its hybrid matrix must be [[0, 1], [-1, 0]] up to rounding. The position error between slave and
+    master must decay: its poles must have negative real parts.
     """
     v = samples[0].values
     return Evaluation((
@@ -101,7 +104,10 @@ def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the four-channel teleoperator has scattering norm 1 and is stable with any passive hand and task."""
+    """Check that the four-channel teleoperator has scattering norm 1 and is stable with passive hands and tasks.
+
+    The loop must be stable for all of 100 random passive hands and tasks.
+    """
     v = samples[0].values
     return Evaluation((
         check_deterministic_value("largest scattering norm", v["norm"], (1.0 - 1e-9, PASSIVE_NORM), "1 (3.33)",
@@ -114,10 +120,10 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 def build_intervening_impedance_port(case: TeleoperatorAxis) -> TwoPort:
     """Return the four-channel two-port whose operator feels an additional impedance, Zhu 1994, (3.37).
 
-    Its channels need no acceleration signals.
+    The additional impedance is that of the master. The channels need no acceleration signals.
 
     Args:
-        case: master and slave with damper and spring added to their masses.
+        case: teleoperator whose master and slave have a damper and a spring in addition to their masses.
 
     Returns:
         The two-port.
@@ -136,8 +142,8 @@ def measure_intervening_impedance(changes: Changes) -> Sample:
         changes: `slave_mass`: factor of the slave's mass.
 
     Returns:
-        Relative error of the felt impedance against master plus task, and the stable fraction of loops
-        with random hands and tasks.
+        `felt`: largest difference of the felt impedance from that of master plus task, over the largest
+        magnitude of the latter. `stable`: stable fraction of 100 loops with random hands and tasks.
     """
     given = merge_settings({"slave_mass": 1.0}, changes)
     case = make_identical_sides_case()
@@ -175,10 +181,12 @@ _FORCE_ERRORS = np.geomspace(1e-3, 100.0, 26)
 
 
 def find_destabilizing_force_error(case: TeleoperatorAxis) -> float:
-    """Return the smallest relative error of the force feed-forward that destabilizes the loop.
+    """Return the smallest relative error of the force feed-forward that destabilizes the closed loop.
+
+    The four-channel structure under position control feeds the hand force forward to the slave.
 
     Args:
-        case: teleoperator with hand and task; four channels under position control.
+        case: teleoperator with hand and task.
 
     Returns:
         The error [1]; infinite if no error up to 100 destabilizes the loop, 0 if the smallest
@@ -200,10 +208,13 @@ def measure_destabilizing_force_error(changes: Changes) -> Sample:
     """Find the smallest destabilizing error of the force feed-forward under several conditions.
 
     Args:
-        changes: `scale`: factor of the controllers' gains.
+        changes: `scale`: factor of the controllers' gains in `limit`.
 
     Returns:
-        Smallest destabilizing errors; gain factor and hand stiffness factor for which 5 % suffices.
+        Smallest destabilizing relative errors: with identical sides (`limit`), with the shipped slave
+        (`machine`), and with a delay of 5 ms each way (`late`). Largest factor of the controllers' gains
+        (`scale`) and smallest factor of the hand's stiffness (`hand`) for which 5 % suffice. `norm`:
+        scattering norm with 5 %.
     """
     given = merge_settings({"scale": 1.0}, changes)
     case = make_identical_sides_case()
@@ -237,7 +248,10 @@ def measure_destabilizing_force_error(changes: Changes) -> Sample:
 
 
 def evaluate_destabilizing_force_error(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether an error of 5 % of the force feed-forward destabilizes the four-channel structure."""
+    """Check whether an error of at most 5 % of the force feed-forward destabilizes the four-channel structure.
+
+    The error is relative. Master and slave are identical, under position control and without delay.
+    """
     v = samples[0].values
     return Evaluation(
         (check_deterministic_value("smallest relative error of the force feed-forward that is unstable",
@@ -259,10 +273,12 @@ def measure_felt_impedance_extremes(changes: Changes) -> Sample:
     """Compute the impedance felt under rate control with force feedback for very stiff and very soft tasks.
 
     Args:
-        changes: `structure_with_task`: 1 for the transparent four-channel structure.
+        changes: `structure_with_task`: 1 for the transparent four-channel structure, 0 for rate control
+            with force feedback.
 
     Returns:
-        Relative differences from Zhu 1994, (3.50) for stiff and (3.51) for soft tasks.
+        Relative differences of the felt impedance from Zhu 1994, (3.50) for `stiff` and (3.51) for `soft`
+        tasks.
     """
     given = merge_settings({"structure_with_task": 0.0}, changes)
     case, s = load_shipped_case(), 1j * HAND_FREQUENCIES
@@ -297,7 +313,7 @@ def build_rate_control_port(case: TeleoperatorAxis, velocity_gain: float = 1.0) 
     """Return the four-channel two-port under rate control, Zhu 1994, (3.59).
 
     Args:
-        case: master and slave with damper and spring added to their masses.
+        case: teleoperator, whose masses and controllers are used.
         velocity_gain: slave's velocity over the master's position [1/s].
 
     Returns:
@@ -317,7 +333,8 @@ def measure_rate_transparency(changes: Changes) -> Sample:
         changes: `slave_mass`: factor of the slave's mass.
 
     Returns:
-        Relative errors of felt impedance and velocity.
+        `felt`: relative error of the felt impedance against master plus task. `velocity`: relative error
+        of the slave's velocity against the velocity gain times the master's position.
     """
     given = merge_settings({"slave_mass": 1.0}, changes)
     case, s = make_identical_sides_case(), 1j * HAND_FREQUENCIES
@@ -349,14 +366,15 @@ def evaluate_rate_transparency(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_stability_without_damping(changes: Changes) -> Sample:
-    """Test whether rate control is stable if the master has no damping, Zhu 1994, (3.72).
+    """Test whether four-channel rate control is stable if the master has no damping, Zhu 1994, (3.72).
 
     Args:
-        changes: `damping`: damping of the master [N s/m].
+        changes: `damping`: damping of the master in `unstable` and `poles` [N s/m].
 
     Returns:
-        Unstable fraction of random characteristic polynomials (3.72), number of unstable poles of the
-        whole loop, and whether its simulated impulse response decays.
+        `unstable`: unstable fraction of 200 random characteristic polynomials (3.72). `poles`: number of
+        unstable poles of the whole loop of identical sides without a hand. `kick`: 1 if the simulated
+        impulse response of the loop with a hand without damping decays, else 0.
     """
     given = merge_settings({"damping": 0.0}, changes)
     rng = np.random.default_rng(372)
@@ -407,15 +425,16 @@ _EVALUATION_TIME = 4.0  # last seconds of a task, in which the stiffness error i
 
 
 def measure_task_identification(seed: int, changes: Changes) -> Sample:
-    """Estimate mass, damper and spring of a changing task by recursive least squares.
+    """Estimate mass, damping and stiffness of a simulated task by recursive least squares; the task changes once.
 
     Args:
         seed: seed of motion and noise.
-        changes: `forgetting`: forgetting factor; `reset`: error over its usual size at which the
-            covariance is reset; `noise`: relative force noise.
+        changes: `forgetting`: forgetting factor per sample of 20 ms; `reset`: prediction error over its
+            usual size at which the covariance is reset; `noise`: RMS force noise over RMS force.
 
     Returns:
-        Largest relative stiffness errors before and after the task changes.
+        Largest relative stiffness errors in the last 4 s `before` the task changes, and in the last 4 s
+        of the run, `after` the change.
     """
     given = merge_settings({"forgetting": 0.99, "reset": 8.0, "noise": 0.02}, changes)
     rng = np.random.default_rng([seed, 374])
@@ -453,7 +472,11 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_task_identification(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the estimated stiffness of a changing task errs by less than 23 % before and after the change."""
+    """Check that the estimated stiffness of a changing task errs by less than 23 % before and after the change.
+
+    The error is the largest one in the last 4 s before the change and in the last 4 s of the run,
+    averaged over repetitions.
+    """
     reason = "23 % of a compliance is not noticeable (Tan 1995); no size is published"
     return Evaluation(
         tuple(

@@ -54,7 +54,7 @@ PASSIVE_NORM = 1.0 + 1e-9  # largest scattering norm of a passive two-port, with
 
 
 def make_deterministic_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
-    """Return an experiment without randomness, which is run once."""
+    """Return an experiment that is run once, because its measurement `measure` needs no seed."""
     return Experiment(name, partial(_measure_without_seed, measure), claims, fixed_repetitions=1)
 
 
@@ -74,7 +74,7 @@ def make_identical_sides_case() -> TeleoperatorAxis:
 
 
 def make_constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a transfer function that has the same value at all frequencies."""
+    """Return a function of the complex frequency s that has the same value at all frequencies."""
     return lambda s: np.full_like(s, value)
 
 
@@ -93,10 +93,11 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
     impedances.
 
     Args:
-        changes: `velocity_back_sign`: sign of the returned velocity in the numerical solution.
+        changes: `velocity_back_sign`: sign of the velocity that is returned from the slave to the master,
+            in the numerical solution.
 
     Returns:
-        Relative errors of both formulas.
+        Largest relative errors of the formulas of hybrid matrix (`matrix`) and felt impedance (`felt`).
     """
     given = merge_settings({"velocity_back_sign": 1.0}, changes)
     rng = np.random.default_rng(313)
@@ -146,7 +147,8 @@ def measure_delayed_channel(changes: Changes) -> Sample:
             transmission line in its place.
 
     Returns:
-        `least`: smallest norm over the delays; `lossless`: largest norm of the lossless line.
+        `least`: smallest value over six delays of the largest norm over frequencies. `lossless`: largest
+        norm of a lossless transmission line over delays and frequencies.
     """
     given = merge_settings({"wave_impedance": 0.0}, changes)
     delays = np.array([1e-3, 1e-2, 5e-2, 0.2, 1.0, 5.0])
@@ -170,7 +172,7 @@ def measure_delayed_channel(changes: Changes) -> Sample:
 def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
     """Check that a channel with delayed force and velocity is not passive for any delay.
 
-    Its scattering norm must exceed 1.
+    For every tested delay, the largest scattering norm over frequencies must exceed 1.
     """
     values = samples[0].values
     return Evaluation(
@@ -186,13 +188,14 @@ _DELAYS, _GAIN_FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30
 def compare_nyquist_with_simulation(changes: Changes) -> Sample:
     """Compare predicted stability with the simulated impulse response of four teleoperator structures.
 
-    The prediction applies the argument principle to the loop transfer functions.
+    The prediction applies the argument principle (Nyquist criterion) to the loop transfer functions. Three
+    delays and four gains are tested per structure.
 
     Args:
         changes: `simulated_task`: stiffness factor of the simulated task.
 
     Returns:
-        `fraction` of loops in which both agree, and number of loops `cells`.
+        `fraction` of the loops in which prediction and simulation agree, and number of loops (`cells`).
     """
     given = merge_settings({"simulated_task": 1.0}, changes)
     case, right, cells = load_shipped_case(), 0, 0
@@ -224,11 +227,12 @@ def compare_with_mechanical_equivalent(changes: Changes) -> Sample:
     """Compare the position-position structure with two masses joined by a spring and a damper.
 
     Args:
-        changes: `slave_gain`: gain of the slave's over the master's controller; `coupling_gain`:
-            factor of spring and damper of the equivalent.
+        changes: `slave_gain`: gain of the slave's over the master's controller; `coupling_gain`: factor
+            of spring and damper between the masses.
 
     Returns:
-        `norm`: largest scattering norm; `difference`: relative difference of hybrid matrices.
+        `norm`: largest scattering norm of the position-position structure. `difference`: largest relative
+        difference of its hybrid matrix from that of the joined masses.
     """
     given = merge_settings({"slave_gain": 1.0, "coupling_gain": 1.0}, changes)
     case = make_identical_sides_case()
@@ -257,9 +261,9 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the position-position structure has the hybrid matrix of two masses that are joined.
+    """Check that the position-position structure has the hybrid matrix of two joined masses.
 
-    A spring and a damper join them.
+    A spring and a damper join the masses. Differences may be rounding only.
     """
     return Evaluation((
         check_deterministic_value("largest relative difference of the hybrid matrices",
@@ -281,7 +285,10 @@ def measure_contact_position_error(seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        Position error and noise [m], their ratio, contact force [N], and relative stiffness error.
+        `shift`: change of the mean position error (reference minus measured height) from free motion to
+        contact [m]. `noise`: standard deviation of measured minus true height [m]. `ratio`: shift over
+        noise. `force`: estimated contact force [N]. `law`: RMS relative difference of the joystick's
+        stiffness from (4.1).
     """
     keys = {"duration": str(_FIRST_TARGET_DURATION)} | make_random_operator_settings(seed) | dict(changes)
     scenario, run = run_shipped_scenario("press_stiffness", keys)
@@ -320,7 +327,7 @@ def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
     """Check that the joystick's stiffness changes with the contact force by Zhu 1994, (4.1).
 
-    Its parameters are those of Tables 6.7 and 6.8.
+    The parameters of (4.1) are those of Tables 6.7 and 6.8. The RMS relative difference may be 5 %.
     """
     return Evaluation((
         check_mean("RMS difference of the stiffness along z from (4.1), relative",
@@ -336,7 +343,8 @@ def compute_direct_force_margins(changes: Changes) -> Sample:
         changes: `task`: factor of the task's impedance.
 
     Returns:
-        Largest stable factors of the reflected force, without delay and with 20 ms each way.
+        Largest stable factors of the reflected force, 1 for the shipped one: `rate` and `position`
+        without delay, `late_rate` and `late_position` with a delay of 20 ms each way.
     """
     given = merge_settings({"task": 1.0}, changes)
     case, k = load_shipped_case(), given["task"]
@@ -354,7 +362,8 @@ def compute_direct_force_margins(changes: Changes) -> Sample:
 def evaluate_rate_force_margin(samples: Sequence[Sample]) -> Evaluation:
     """Check that rate control with direct force feedback has a stability limit even without delay.
 
-    It must be below that of position control.
+    The limit is the largest stable factor of the reflected force. It must be at most 100, and below that
+    of position control.
     """
     v = samples[0].values
     ratio = v["rate"] / v["position"]
@@ -375,7 +384,8 @@ def evaluate_rate_force_margin(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_position_force_margin(samples: Sequence[Sample]) -> Evaluation:
     """Check that position control with direct force feedback becomes stable if its gain is reduced.
 
-    With the shipped gain and a delay of 20 ms each way it is unstable.
+    With the shipped gain of the reflected force and a delay of 20 ms each way it must be unstable. With a
+    smaller gain it must be stable.
     """
     v = samples[0].values
     return Evaluation(
@@ -390,11 +400,11 @@ def measure_impedance_difference(changes: Changes) -> Sample:
     """Compute how much the felt impedance differs from the task's impedance at hand frequencies.
 
     Args:
-        changes: `transparent`: 1 for the transparent four-channel structure.
+        changes: `transparent`: 1 to use the transparent four-channel structure instead of all structures.
 
     Returns:
-        Largest relative difference of the position-position, the position-force and the rate-force
-        structure.
+        Largest magnitude of felt over task impedance minus 1, for the position-position, the
+        position-force and the rate-force structure.
     """
     given = merge_settings({"transparent": 0.0}, changes)
     case, s, values, curves = load_shipped_case(), 1j * HAND_FREQUENCIES, {}, {}

@@ -38,10 +38,11 @@ class DeviceLimits(NamedTuple):
     """Travel and output limits of a device.
 
     Attributes:
-        half_travel: half range from the centre [m].
-        max_rotation: half range [rad]; 0 for a device that does not measure or drive rotations.
-        max_force: maximum force [N].
-        max_torque: maximum torque [N m].
+        half_travel: half range of the handle's translation along each axis, from its centre [m].
+        max_rotation: half range of its rotation about each axis [rad]; 0 for a device that does not
+            measure or drive rotations.
+        max_force: maximum magnitude of the output force [N].
+        max_torque: maximum magnitude of the output torque [N m].
     """
 
     half_travel: float
@@ -55,8 +56,8 @@ class HandlePose(NamedTuple):
 
     Attributes:
         place: (3,) position from its centre [m]; x away from the user, y to the left, z up.
-        quaternion: (4,) scalar first.
-        buttons: bit mask, one bit per button.
+        quaternion: (4,) orientation of the handle in these axes, scalar first.
+        buttons: bit mask, one bit per button, 1 while it is pressed.
     """
 
     place: np.ndarray
@@ -81,11 +82,12 @@ class HapticDevice(Protocol):
         ...
 
     def write(self, wrench: np.ndarray, is_active: bool) -> None:
-        """Apply a wrench (6,) [N], [N m] to the handle until the next call.
+        """Apply a wrench to the handle until the next call.
 
         Args:
-            wrench: zero while no machine is in control.
-            is_active: whether a machine is in control.
+            wrench: (6,) force [N] and torque [N m] on the handle; zero while no machine is in
+                control.
+            is_active: whether a machine is in control of the wrench.
 
         Raises:
             OSError: the device does not answer.
@@ -100,12 +102,14 @@ class HapticDevice(Protocol):
 def limit_wrench(wrench: np.ndarray, limits: DeviceLimits) -> np.ndarray:
     """Limit a wrench to the maximum force and torque of a device, keeping both directions.
 
+    Force and torque are scaled separately, each only if its magnitude exceeds its limit.
+
     Args:
-        wrench: (6,) [N], [N m].
+        wrench: (6,) force [N] and torque [N m].
         limits: limits of the device.
 
     Returns:
-        (6,), zero if an element of the wrench is not finite.
+        (6,) limited wrench; zero if an element of the wrench is not finite.
 
     >>> limit_wrench(np.array([30.0, 0, 40.0, 0, 0, 0.1]), DeviceLimits(0.05, 0.5, 5.0, 0.4)).tolist()
     [3.0, 0.0, 4.0, 0.0, 0.0, 0.1]
@@ -131,8 +135,9 @@ class SimulatedDeviceParameters:
         arm_mass: mass and inertia of the arm [kg], [kg m^2].
         arm_damping: damping of the arm [N s/m], [N m s/rad].
         arm_stiffness: stiffness of the arm [N/m], [N m/rad].
-        motion_amplitudes: amplitudes of the reference motion, as fractions of the travel [1].
-        motion_frequencies: frequencies of the reference motion for x, y, z, rx, ry, rz [Hz], all different.
+        motion_amplitudes: amplitudes of the sines x, y, z, rx, ry, rz that the arm's reference pose
+            follows, as fractions of the half range of each axis [1].
+        motion_frequencies: frequencies of these sines [Hz], all different.
     """
 
     limits: DeviceLimits = DeviceLimits(0.06, 0.6, 12.0, 0.4)
@@ -160,7 +165,10 @@ class SimulatedDeviceParameters:
 
 
 class SimulatedDevice:
-    """Simulate a device without hardware; every call of `read` advances it by one period."""
+    """Simulated handle that an operator's arm holds, used in place of hardware.
+
+    Every call of `read` advances the simulation by one period.
+    """
 
     def __init__(self, period: float, parameters: SimulatedDeviceParameters | None = None) -> None:
         """Start with the handle at rest in its centre.
@@ -201,7 +209,11 @@ class SimulatedDevice:
         return HandlePose(x[:3].copy(), quaternion, 0)
 
     def write(self, wrench: np.ndarray, is_active: bool) -> None:
-        """Apply a wrench; the simulated operator moves 1 s after a machine takes control."""
+        """Set the wrench (6,) [N], [N m] on the handle and advance the operator's time by a period.
+
+        The operator's arm starts its reference motion after 1 s of calls with `is_active` true. A
+        call with `is_active` false holds the arm's reference at the centre and restarts this delay.
+        """
         self._wrench[:] = wrench
         self._time = self._time + self._period if is_active else -_MOTION_DELAY
 
@@ -212,9 +224,13 @@ class SimulatedDevice:
 
 @compiled
 def _integrate_handle(parameters, reference, wrench, period, state):
-    """Integrate the motion of handle and operator's arm over one period with semi-implicit Euler steps.
+    """Integrate the motion of handle and operator's arm over one period by semi-implicit Euler.
 
-    The six axes are independent. `state` (2, 6) holds positions and rates and is updated.
+    The six axes are independent. A stiff, damped stop limits the travel of each axis.
+
+    The rows of `parameters` (6, 6) are mass and friction of the handle, mass, damping and stiffness
+    of the arm, and half range. `reference` (6,) is the arm's reference pose, `wrench` (6,) the
+    device's output. `state` (2, 6) holds positions and rates and is updated.
     """
     mass, friction, hand_mass, hand_damping, hand_stiffness, stop = parameters
     step = period / _SUBSTEPS
@@ -250,7 +266,7 @@ _DHD_DEFAULT_LIMITS = DeviceLimits(0.05, 0.0, 8.0, 0.0)  # for a device that is 
 
 
 class ForceDimension:
-    """Drive the first connected Force Dimension device."""
+    """Driver of the first connected Force Dimension device."""
 
     def __init__(self, dhd: Any = None) -> None:
         """Open the device and switch on its gravity compensation and forces.
@@ -286,7 +302,9 @@ class ForceDimension:
         return HandlePose(_DHD_TO_DEVICE_AXES @ np.array(self._place), _matrix_to_quaternion(turn), buttons)
 
     def write(self, wrench: np.ndarray, is_active: bool) -> None:
-        """Apply a wrench to the handle.
+        """Apply a wrench (6,) [N], [N m] in the axes of `HandlePose` to the handle.
+
+        `is_active` is not used.
 
         Raises:
             OSError: the device does not answer.
@@ -302,7 +320,10 @@ class ForceDimension:
 
 
 def _import_dhd() -> Any:
-    """Import the Python binding of Force Dimension's DHD library; raise InputError if it is not installed."""
+    """Import and return the Python binding of Force Dimension's DHD library.
+
+    Raise InputError if it is not installed.
+    """
     try:
         from forcedimension_core import dhd  # pyright: ignore[reportMissingImports] - optional
     except ImportError as error:
@@ -350,20 +371,22 @@ _VIRTUOSE_SIGNATURES = {
 
 
 class Haption:
-    """Drive a Haption device at a network address."""
+    """Driver of a Haption device (Virtuose) at a network address."""
 
     limits = _VIRTUOSE_LIMITS
 
     def __init__(self, period: float, address: str = DEFAULT_HAPTION_ADDRESS, library: Any = None) -> None:
-        """Open the device and switch on its forces.
+        """Open the device, switch on its forces, and take the present handle pose as centre.
 
         Args:
-            period: period of the server [s].
+            period: period of the server [s], which the device uses as its time step.
             address: address of the vendor's service or of the device, `HOST#PORT`.
-            library: the vendor's library; by default the one that VIRTUOSE_API names.
+            library: the vendor's library; by default the one that the environment variable
+                VIRTUOSE_API names, or else an installed one.
 
         Raises:
-            InputError: the library is missing, or no device answers at the address.
+            InputError: the library is missing, no device answers at the address, or the device
+                rejects its settings.
         """
         self._api = api = _declare_signatures(library or _load_virtuose_library())
         self._device = api.virtOpen(address.encode())
@@ -391,7 +414,7 @@ class Haption:
         )
 
     def read(self) -> HandlePose:
-        """Read the current pose of the handle.
+        """Read the current pose of the handle, relative to its pose when the device was opened.
 
         Raises:
             OSError: the device does not answer.
@@ -411,7 +434,9 @@ class Haption:
         )
 
     def write(self, wrench: np.ndarray, is_active: bool) -> None:
-        """Apply a wrench to the handle.
+        """Apply a wrench (6,) [N], [N m] in the axes of `HandlePose` to the handle.
+
+        `is_active` is not used.
 
         Raises:
             OSError: the device does not answer.
@@ -423,7 +448,7 @@ class Haption:
         self._check_return_code(self._api.virtSetForce(self._device, self._wrench_buffer))
 
     def close(self) -> None:
-        """Switch the force off and close the device."""
+        """Apply a zero wrench, switch off the device's power and close it."""
         self._wrench_buffer[:] = [0.0] * 6
         self._api.virtSetForce(self._device, self._wrench_buffer)
         self._api.virtSetPowerOn(self._device, 0)
@@ -439,7 +464,11 @@ class Haption:
 
 
 def _load_virtuose_library() -> Any:
-    """Load Haption's library VirtuoseAPI; raise InputError if it is missing."""
+    """Load and return Haption's library VirtuoseAPI.
+
+    The path is that of the environment variable VIRTUOSE_API, or else of an installed library.
+    Raise InputError if the library is missing or cannot be loaded.
+    """
     name = os.environ.get(LIBRARY_VARIABLE) or ctypes.util.find_library("VirtuoseAPI")
     if not name:
         message = f"needs the vendor's libVirtuoseAPI: install it, or set {LIBRARY_VARIABLE} to its path"
@@ -451,7 +480,10 @@ def _load_virtuose_library() -> Any:
 
 
 def _declare_signatures(library: Any) -> Any:
-    """Declare the argument and return types of the VirtuoseAPI functions; return the library."""
+    """Declare the argument and return types of the VirtuoseAPI functions; return the library.
+
+    Raise InputError if the library does not have one of these functions.
+    """
     for name, arguments in _VIRTUOSE_SIGNATURES.items():
         try:
             function = getattr(library, name)
@@ -466,7 +498,7 @@ def _declare_signatures(library: Any) -> Any:
 
 
 def _multiply_quaternions(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Multiply two quaternions (4,), scalar first."""
+    """Return the product `a b` of two quaternions (4,), scalar first: rotate by b, then by a."""
     import mujoco
 
     out = np.empty(4)

@@ -84,17 +84,21 @@ class LinkBuffers(NamedTuple):
     """Packets, counters and recorded times of the thread that answers the poses of the device.
 
     Attributes:
-        pose: (21,) received packet as integers.
+        pose: (21,) received pose packet as integers.
         pose_real: (21,) the same memory as reals.
-        reply: (12,) packet to send as integers.
+        reply: (12,) wrench packet to send as integers.
         reply_real: (12,) the same memory as reals.
-        count: (16,) counters and times, see the indices above [1], [ns].
-        ramp: (3,) factor on the forces, scale of positions, scale of rotations.
-        sent: (1024,) send time of a wrench, by its sequence number [ns].
-        answers: (n,) time from the arrival of a pose to the sending of its answer [ns].
-        round_trip_times: (n,) time from the sending of a wrench to the first pose that acknowledges it [ns].
-        intervals: (n,) time between two poses [ns].
-        reach: (2,) range of the joystick [m], [rad].
+        count: (16,) counters [1] and times [ns]; the indices are STOP_FLAG .. POSE_ARRIVAL_TIME.
+        ramp: (3,) first element: factor 0 to 1 on the forces, which rises after a pause; the other
+            two are not used.
+        sent: (1024,) ring buffer of the send times of wrenches [ns]; the index is the sequence
+            number modulo 1024.
+        answers: (n,) ring buffer of times from the arrival of a pose to the sending of its answer
+            [ns].
+        round_trip_times: (n,) ring buffer of times from the sending of a wrench to the first pose
+            that acknowledges it [ns].
+        intervals: (n,) ring buffer of times between the arrivals of two successive poses [ns].
+        reach: (2,) half range of the joystick's translation [m] and rotation [rad].
     """
 
     pose: np.ndarray
@@ -117,12 +121,13 @@ class Mailbox(NamedTuple):
     that is being written; the reader then tries again.
 
     Attributes:
-        turn: (2,) version counters of the handle's part and of the machine's.
-        stamp: (2,) time at which a part was written [ns]; 0 before the first time.
-        handle: (8,) position in joystick scale [m], quaternion, buttons.
+        turn: (2,) version counters: of the handle's part (`handle`), which the thread writes, and
+            of the machine's part (`packet`, `share`, `extra`), which the simulation writes.
+        stamp: (2,) time at which each part was last written [ns]; 0 before the first time.
+        handle: (8,) handle position scaled to the joystick's range [m], quaternion, buttons.
         packet: (rows, k) packet from the machine, see `teleop.master`.
         share: (1,) factor on the packet, 0 to 1.
-        extra: (6,) additional force on the handle [N], [N m].
+        extra: (6,) additional force on the handle, such as tip-over protection [N], [N m].
         parameters: flat MasterParameters.
         state: flat MasterState of the thread.
     """
@@ -159,9 +164,11 @@ def _read_clock(timespec):
 def scale_pose(position, quaternion, scale, rotation_scale, out):
     """Scale the pose of a device's handle to the range of the joystick.
 
+    The rotation keeps its axis; its angle is multiplied by a factor.
+
     Args:
-        position: (3,) position [m].
-        quaternion: (4,) scalar first.
+        position: (3,) position of the handle from its centre [m].
+        quaternion: (4,) orientation of the handle, scalar first.
         scale: factor on the position, scalar.
         rotation_scale: factor on the rotation angle, scalar.
         out: (>= 7,) written: position [m] and quaternion.
@@ -188,7 +195,8 @@ def scale_pose(position, quaternion, scale, rotation_scale, out):
 def answer_pose_packet(buffers, mailbox, now, timespec):
     """Check a received pose packet, count it, and compute the wrench packet that answers it.
 
-    The wrench follows from the joystick's control law and the machine's latest packet.
+    The wrench follows from the joystick's control law and the machine's latest packet. Its force
+    and torque are limited to the maximum values that the pose packet states for the device.
 
     Args:
         buffers: LinkBuffers with the received packet in `pose`. The wrench packet is written to `reply`;
@@ -198,7 +206,8 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
         timespec: (2,) work space of the clock.
 
     Returns:
-        Whether `reply` must be sent; false for a malformed or late packet.
+        Whether `reply` must be sent; false for a malformed packet, or one whose sequence number is
+        not above that of the last pose.
 
     Source: `teleop.master`; this module.
     """
@@ -262,8 +271,11 @@ def _compute_reflected_force(line, box, now, two, first, period):
     """Write the handle's pose into the mailbox and compute the force on the handle by the control law.
 
     The force is stored in the state of the control law, `box.state`. The caller multiplies it by
-    `line.ramp[FORCE_GAIN]`, which is 0 without data from the machine or without a valid pose, and
-    otherwise rises to 1.
+    `line.ramp[FORCE_GAIN]`. This factor is 0 if the machine's data are older than FORCE_TIMEOUT or
+    the pose is not valid; otherwise it rises to 1 within FORCE_RAMP_TIME.
+
+    `line` is LinkBuffers, `box` Mailbox, `now` the time [ns], `two` (2,) work space of the clock.
+    `first` marks the first pose of a session, and `period` is the time since the previous pose [s].
     """
     real = line.pose_real
     scale = line.reach[0] / real[TRAVEL] if real[TRAVEL] > 0.0 else 0.0
@@ -300,7 +312,7 @@ def _compute_reflected_force(line, box, now, two, first, period):
 def _run_answer_loop(socket_fd, buffers, mailbox):
     """Receive pose packets from a socket and answer each with a wrench until `count[STOP_FLAG]` is set.
 
-    While no pose arrives, connection requests are sent to the server.
+    While no pose arrives, a connection request is sent to the server every 100 ms.
     """
     two, count = np.zeros(2, np.int64), buffers.count
     size, answer = np.uint64(8 * POSE_WORDS), np.uint64(8 * WRENCH_WORDS)
@@ -377,7 +389,8 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
         now: current time, scalar [ns].
 
     Returns:
-        Whether the pose is valid and the handle is or has been in its dead bands.
+        The new value of `engaged`: whether the pose is finite and not older than POSE_TIMEOUT, and
+        the handle is, or has been since then, in the dead bands of all axes.
 
     Source: this module.
     """
@@ -399,7 +412,10 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
 
 @compiled
 def _is_handle_centred(pose, dead):
-    """Return whether the handle is inside the dead bands `dead` (6,) [m], [rad] of all axes."""
+    """Return whether a handle pose (8,) is in the dead bands `dead` (6,) [m], [rad] of all axes.
+
+    Rotation angles are approximated by twice the vector part of the quaternion.
+    """
     for i in range(3):
         if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
             return False
@@ -439,12 +455,12 @@ class HapticLink:
         self._counters_at_restart = np.zeros(2, np.int64)
 
     def start(self, parameters: MasterParameters, template: MasterState, packet_shape: tuple[int, ...]) -> None:
-        """Start the thread that answers poses.
+        """Create the mailbox and start the thread that answers the device's poses.
 
         Args:
             parameters: parameters of the master's control law.
-            template: a master state; the thread's own state gets the same shapes.
-            packet_shape: shape of the machine's packets.
+            template: a master state; the state that the thread uses gets the same array shapes.
+            packet_shape: shape (rows, k) of the machine's packets.
 
         Raises:
             InputError: the kind of force reflection does not support haptic devices.
@@ -499,23 +515,31 @@ class HapticLink:
         self.engaged = exchange_with_mailbox(self._mailbox_record, qpos, packet, packet_gain, extra, self.engaged, now)
 
     def pose(self) -> HandlePose | None:
-        """Return the handle's pose in joystick scale, None while no pose arrives."""
+        """Return the handle's latest pose, scaled to the joystick's range.
+
+        It is None if the latest pose is not finite or is older than `POSE_TIMEOUT`.
+        """
         values = np.empty(8)
         if not read_pose_from_mailbox(self._mailbox_record, clock.monotonic_ns(), values):
             return None
         return HandlePose(values[:3], values[3:7], int(values[7]))
 
     def reset_statistics(self) -> None:
-        """Reset the statistics, for example after the device has waited for the machine."""
+        """Reset the counts and recorded times of `statistics`, except the number of server starts.
+
+        The device's own counters cannot be reset; their present values are subtracted from now on.
+        """
         line = self.buffers
         line.count[[ANSWERS, ROUNDS, INTERVALS, RECEIVED, LOST, LATE, MALFORMED]] = 0
         self._counters_at_restart = line.pose[[MISSED, UNANSWERED]]
 
     def statistics(self) -> dict[str, Any]:
-        """Return statistics of the connection.
+        """Return statistics of the connection since its start or since `reset_statistics`.
 
-        They contain the counts of received, lost, late and malformed poses, server starts and periods that
-        the device missed. Answer, round-trip and interval times are given as percentiles and histogram.
+        Counted are received (`poses`), lost, late and malformed poses, starts of the device's
+        server, and periods that the device missed or began without an answer. `priority` is whether
+        the thread has real-time priority. The times for an answer, a round trip (`loop`) and
+        between two poses (`interval`) are given as percentiles and histogram.
         """
         line, count = self.buffers, self.buffers.count
         return {
@@ -533,7 +557,7 @@ class HapticLink:
         }
 
     def close(self) -> None:
-        """Stop the thread; the device then switches its force off."""
+        """Stop the thread and close the socket, after which the device switches its force off."""
         self.buffers.count[STOP_FLAG] = 1
         if self._thread:
             self._thread.join()

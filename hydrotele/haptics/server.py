@@ -74,11 +74,13 @@ class ServerSummary(NamedTuple):
 
     Attributes:
         periods: number of periods.
-        missed: number of periods that were skipped or started more than a period late.
+        missed: number of periods that were skipped, because the previous one lasted beyond their
+            start.
         unanswered: number of periods that started without the answer to the previous pose.
         rejected: number of rejected packets, by reason.
-        watchdog_trips: number of times that the watchdog switched the force off.
-        wake_delay: delay of the start of a period, see `summarise_durations`.
+        watchdog_trips: number of times that the force was switched off because no wrench was
+            accepted for WATCHDOG_TIMEOUT.
+        wake_delay: delay of the start of a period after its deadline, see `summarise_durations`.
         round_trip: time from sending a pose to receiving its answer, see `summarise_durations`.
         priority: whether real-time priority was granted.
         load: load averages of the computer, see `read_load_averages`.
@@ -99,14 +101,15 @@ class DeviceSession:
     """Protocol state between a device and a machine, independent of sockets and clocks.
 
     Attributes:
-        pose: packet to send.
+        pose: pose packet to send to the machine.
         wrench: (6,) wrench that the device must apply now [N], [N m].
         client: address of the connected machine, None without one.
         rejected_packets: number of rejected packets, by reason.
-        watchdog_trips: number of times that the watchdog switched the force off.
+        watchdog_trips: number of times that the force was switched off because no wrench was
+            accepted for WATCHDOG_TIMEOUT.
         unanswered: number of periods that started without the answer to the previous pose.
-        missed: number of periods that the device has missed.
-        answered: sequence number of the last answered pose.
+        missed: number of skipped periods, which the caller counts.
+        answered: sequence number of the pose that the last accepted packet answers.
     """
 
     def __init__(self, device: HapticDevice, period: float, session: int) -> None:
@@ -134,12 +137,14 @@ class DeviceSession:
         self._forces_on, self.answered = False, -1
 
     def apply_wrench_and_read_pose(self, now: int) -> None:
-        """Run one period: check the timeouts, apply the wrench, and write the handle's pose into the packet `pose`.
+        """Run one period: check the timeouts, apply the wrench, write the handle's pose to `pose`.
+
+        Without an accepted packet the force is switched off after WATCHDOG_TIMEOUT, and the machine
+        is disconnected after CLIENT_TIMEOUT. If the device does not answer, the packet states that
+        it cannot apply forces, its pose is NaN, and the wrench is set to zero.
 
         Args:
             now: current time [ns].
-
-        A device that does not answer is reported as unable and gets a zero wrench until it answers.
         """
         whole, real = self.pose
         if self.client and whole[SEQUENCE] >= 0 and self.answered < whole[SEQUENCE]:
@@ -163,7 +168,11 @@ class DeviceSession:
         whole[MISSED], whole[UNANSWERED] = self.missed, self.unanswered
 
     def accept_packet(self, data: bytes | memoryview, sender: Address, now: int) -> bool:
-        """Check a packet from a machine and accept it if it is valid.
+        """Check a packet from a machine, and use it if it is valid.
+
+        A valid wrench packet replaces `wrench`, limited to the device's maximum; it sets zero if
+        the machine is not in control. A valid connection request makes its sender the connected
+        machine. A rejected packet is only counted, by its reason.
 
         Args:
             data: bytes of the packet.
@@ -189,7 +198,11 @@ class DeviceSession:
         return True
 
     def _rejection_reason(self, data, sender: Address) -> str:
-        """Return the reason to reject a packet, or an empty string; copy the packet to `_answer`."""
+        """Return the reason to reject a packet, or an empty string; copy the packet to `_answer`.
+
+        Reasons: `malformed` (length, first word, or a value that is not finite), `other_client`,
+        `session`, `late` (sequence number not above the last one), `stale` (answers an old pose).
+        """
         if len(data) != 8 * WRENCH_WORDS:
             return "malformed"
         self._answer.byte_view[:] = data
@@ -212,7 +225,9 @@ def run_device_server(
     device: HapticDevice, address: Address, period: float, should_stop: Callable[[], bool],
     on_open: Callable[[Address], None] = lambda where: None,
 ) -> ServerSummary:  # fmt: skip
-    """Run the server of a device until `should_stop` returns true.
+    """Run the UDP server of a device until `should_stop` returns true.
+
+    Once per period the wrench is applied, the handle is read, and its pose is sent to the machine.
 
     Args:
         device: the device; its force is off afterwards, and it stays open.
@@ -252,10 +267,10 @@ def run_device_server(
 def _run_server_periods(
     line: socket.socket, exchange: DeviceSession, period: float, over: Callable[[], bool]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Run one period after the other until `over()` is true.
+    """Run the server's periods one after the other until `over()` is true.
 
-    Return the delays of the starts of the periods [ns], the times from sending a pose to receiving its
-    answer [ns], and the number of periods.
+    `line` is the UDP socket, `exchange` the session. Return the delays of the starts of the periods
+    [ns], the times from sending a pose to receiving its answer [ns], and the number of periods.
     """
     wake, trips = np.zeros(_MAX_SAMPLES, np.int64), np.zeros(_MAX_SAMPLES, np.int64)
     step, spin, now = round(1e9 * period), round(1e9 * BUSY_WAIT_TIME), clock.monotonic_ns
@@ -285,9 +300,11 @@ def _run_server_periods(
 
 
 def _receive_packet(line: socket.socket, exchange: DeviceSession, view: memoryview, trip, now) -> int:
-    """Receive one packet, if any; return 1 if it answers the pose of this period, otherwise 0.
+    """Receive at most one packet and pass it to the session `exchange`.
 
-    For such an answer, `trip[0]` receives the time since the pose was sent [ns].
+    `view` is the receive buffer and `now` returns the time [ns]. Return 1 if the packet is accepted
+    and answers the pose of this period, and write the time since that pose was sent [ns] to
+    `trip[0]`. Otherwise, or if `trip` is empty, return 0.
     """
     try:
         size, sender = line.recvfrom_into(view)

@@ -36,8 +36,9 @@ def summarise_durations(nanoseconds: np.ndarray) -> dict:
         nanoseconds: (n,) durations [ns].
 
     Returns:
-        count, percentiles [us] by name, and a histogram: upper edges [us], and the counts with an
-        additional one for values above the last edge.
+        `count`, `percentiles_us` [us] by name, and `histogram` with the edges between its bins [us]
+        and the number of durations in each bin. The first bin holds durations below the first edge,
+        the last one those above the last edge.
 
     >>> summarise_durations(np.array([5_000, 15_000, 9_000_000]))["histogram"]["count"]
     [1, 1, 0, 0, 0, 0, 0, 0, 0, 1]
@@ -60,13 +61,14 @@ def summarise_durations(nanoseconds: np.ndarray) -> dict:
 
 
 class RealTimePacer:
-    """Synchronise simulated time with the wall clock, with a deadline for every tick.
+    """Pacer that keeps simulated time in step with the wall clock, with a deadline for every tick.
 
-    Small delays are caught up. After a delay of more than `max_delay`, simulated time is set back.
+    After a small delay the next ticks run without waiting until the delay is caught up. After a
+    delay of more than `max_delay` all later deadlines are shifted by it instead (a pause).
 
     Attributes:
-        pauses: number of times that simulated time was set back.
-        total_delay: total time by which it was set back [s].
+        pauses: number of times that the deadlines were shifted.
+        total_delay: total time by which the deadlines were shifted [s].
         missed: number of ticks that missed their deadline.
         ticks: total number of ticks.
         priority: whether real-time priority was granted.
@@ -81,7 +83,7 @@ class RealTimePacer:
         Args:
             max_ticks: maximum number of ticks whose delay is recorded.
             priority_level: real-time priority from the first tick on, see `reduce_timing_jitter`; 0 requests none.
-            max_delay: delay after which simulated time is set back [s].
+            max_delay: delay above which the deadlines are shifted [s].
             now: function that returns the time [ns].
             sleep: function that waits for a time [s].
         """
@@ -100,13 +102,17 @@ class RealTimePacer:
         return self._now() * 1e-9
 
     def wait_for_tick(self, simulated: float) -> float:
-        """Wait for the deadline of a tick after its work is done.
+        """Wait until the wall clock reaches the simulated time, after the work of a tick is done.
+
+        The first call starts the clock and does not wait. A call after the deadline returns at once
+        and counts the tick as missed.
 
         Args:
-            simulated: time that has been simulated [s].
+            simulated: time that has been simulated [s]; it defines the tick's deadline.
 
         Returns:
-            Time by which simulated time was set back [s]; 0 if it keeps up.
+            Time by which this call shifted the deadlines [s]; 0 unless the delay exceeds
+            `max_delay`.
         """
         due, now = round(simulated * 1e9), self._now()
         if self._start is None:
@@ -137,7 +143,10 @@ class RealTimePacer:
         self._priority_stack.close()
 
     def delays(self) -> np.ndarray:
-        """Return the delays (n,) of the ticks that missed their deadline [ns]."""
+        """Return by how much the ticks that missed their deadline were late, (n,) [ns].
+
+        Only the first `max_ticks` ticks are recorded.
+        """
         late = self._lateness[: self.ticks]
         return late[late > 0]
 
@@ -171,7 +180,7 @@ def measure_missed_deadlines(
 
 
 def read_steal_time(stat: Path = _STAT_FILE) -> float | None:
-    """Return the processor time that the host has taken from a virtual machine since its start.
+    """Return the processor time that the host has taken from this virtual machine since it booted.
 
     Args:
         stat: file with the kernel's statistics, in clock ticks.
@@ -215,10 +224,12 @@ def request_realtime_priority(level: int) -> bool:
 
 @contextlib.contextmanager
 def reduce_timing_jitter(level: int) -> Iterator[bool]:
-    """Reduce timing jitter: no garbage collection, exact sleeps, small pages, real-time priority.
+    """Reduce timing jitter inside a `with` block.
 
-    Priority and a short processor wake-up time are set only where the system permits them.
-    Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
+    The block runs without garbage collection, with exact sleeps, small pages and real-time
+    priority. Priority and a short processor wake-up time are set only where the system permits
+    them. Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
+    Afterwards normal priority, garbage collection and huge pages are restored.
 
     Args:
         level: see `request_realtime_priority`; 0 requests none.

@@ -41,7 +41,7 @@ def actuator_friction(user, u, velocity):
     """Return the Coulomb, Stribeck and viscous friction force of an actuator at a velocity.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
@@ -67,7 +67,7 @@ def actuator_friction_slope(user, u, velocity):
     """Return the derivative of an actuator's friction force with respect to its velocity.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
@@ -84,17 +84,17 @@ def actuator_friction_slope(user, u, velocity):
 
 @compile_without_allocation
 def actuator_end_stop_force(user, u, position, velocity):
-    """Return the force of an actuator's end stops, its stiffness and its damping.
+    """Return the force, stiffness and damping of an actuator's end stop at a position.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         position: position of the load side, scalar [m] or [rad].
         velocity: velocity of the load side, scalar [m/s] or [rad/s].
 
     Returns:
-        (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
-        [N s/m] or [N m s/rad]); all 0 between the stops.
+        (force, which points towards the inside of the travel [N] or [N m], its stiffness [N/m] or
+        [N m/rad], its damping [N s/m] or [N m s/rad]); all 0 between the stops.
 
     Source: `laws.end_stop_force`.
     """
@@ -115,12 +115,13 @@ def pump_drive_volumes(user, u, x):
     """Return, for an axis with its own pump, both chamber volumes and the oil taken from the accumulator.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
         x: piston displacement, scalar [m].
 
     Returns:
-        (head-side volume, rod-side volume, oil volume taken relative to the retracted piston) [m^3].
+        (head-side volume, rod-side volume, oil volume that the accumulator has given off since the
+        piston was fully retracted) [m^3].
 
     Source: geometry of the cylinder.
     """
@@ -135,12 +136,12 @@ def pump_drive_volumes(user, u, x):
 
 @compile_without_allocation
 def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
-    """Compute the pressure rates of both chambers of an axis with its own pump, and their slopes.
+    """Compute the pressure rates of both chambers of an axis with its own pump, and derivatives.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
-        speed: signed speed of its pump, scalar [rad/s].
+        speed: speed of its pump, positive if it feeds the head side, scalar [rad/s].
         p_head: head-side pressure, scalar [Pa].
         p_rod: rod-side pressure, scalar [Pa].
         x: piston displacement, scalar [m].
@@ -151,7 +152,7 @@ def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
 
-    Source: `pump.pump_pressure_rates`.
+    Source: `pump_drive.pump_pressure_rates`.
     """
     volumes, area_head, area_rod = pump_drive_volumes(user, u, x), user[u + _AH], user[u + _AR]
     return pump_pressure_rates(
@@ -165,13 +166,14 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
     """Return the net force of an axis with its own pump, after load cylinder and friction.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         p_load: pressure in the load cylinder, scalar [Pa].
         p_head: head-side pressure, scalar [Pa].
         p_rod: rod-side pressure, scalar [Pa].
         v: piston velocity, scalar [m/s].
-        other_force: all other force on the piston, scalar [N]; static friction resists it.
+        other_force: all other force on the piston, scalar [N]; it is not part of the result, but
+            static friction resists it.
         dt: time step over which the friction acts, scalar [s]; 0 for the friction at velocity v.
 
     Returns:
@@ -188,21 +190,23 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
 
 @compile_without_allocation
 def force_after_friction(user, u, drive_force, other_force, act, velocity, dt):
-    """Return the force of an actuator minus its friction, and the friction slope for an implicit step.
+    """Return the force of an actuator minus its friction, and the friction's derivative by velocity.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
-        drive_force: force before friction, scalar [N] or [N m]; not used for an axis with its own pump.
-        other_force: all other force on the drive, scalar [N] or [N m]. It is not part of the result; the
-            static friction of an axis with its own pump resists it.
-        act: activations from those of this actuator on; used only for an axis with its own pump.
+        drive_force: force before friction, scalar [N] or [N m]; not used for an axis with its own
+            pump.
+        other_force: all other force on the drive, scalar [N] or [N m]. It is not part of the
+            result; the static friction of an axis with its own pump resists it.
+        act: activations, of which the first is that of this actuator: pump speed [rad/s], load
+            pressure, head-side and rod-side pressure [Pa]. Used only for an axis with its own pump.
         velocity: velocity of the drive, scalar [m/s] or [rad/s].
         dt: time step of the friction, scalar [s].
 
     Returns:
-        (force [N] or [N m], dF_f/dv [N s/m] or [N m s/rad]). For an axis with its own pump the
-        friction is that at the end of the step, and the slope is 0.
+        (force [N] or [N m], derivative dF_f/dv of the friction [N s/m] or [N m s/rad]). For an axis
+        with its own pump the friction is that at the end of the step, and the derivative is 0.
 
     Source: models/cat215/README.md, "Force".
     """
@@ -245,19 +249,20 @@ def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
 
 @compile_without_allocation
 def advance_bristle_force(force, velocity, sliding_friction_force, stiffness, dt):
-    """Return the elastic bristle force (presliding friction) after a time at constant velocity.
+    """Return the elastic bristle force (presliding friction) after a duration at constant velocity.
 
     The exact solution is `F' = g + (F - g) exp(-sigma_0 |v| dt / |g|)`.
 
     Args:
-        force: F, scalar [N] or [N m].
+        force: F, elastic bristle force at the start, scalar [N] or [N m].
         velocity: v, scalar [m/s] or [rad/s].
-        sliding_friction_force: g, friction in steady sliding (`sliding_friction`), scalar [N] or [N m].
+        sliding_friction_force: g, friction in steady sliding (`sliding_friction`), scalar [N] or
+            [N m].
         stiffness: sigma_0, scalar [N/m] or [N m/rad].
         dt: duration, scalar [s].
 
     Returns:
-        F', scalar [N] or [N m].
+        F', elastic bristle force at the end, scalar [N] or [N m].
 
     Source: Canudas de Wit et al. 1995, Eq. 1, solved for constant velocity.
 
@@ -277,15 +282,19 @@ def advance_bristle_force(force, velocity, sliding_friction_force, stiffness, dt
 
 @compile_without_allocation
 def _actuator_sliding_friction(user, u, velocity):
-    """Return the dry friction of an actuator that slides at a velocity, see `sliding_friction`."""
+    """Return the dry friction of a sliding actuator (`sliding_friction`) from its parameters in `user`.
+
+    u is the index of the actuator's first parameter in `user`.
+    """
     return sliding_friction(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
 @compile_without_allocation
 def _limited_bristle_stiffness(user, u, inertia, dt):
-    """Return the bristle stiffness of an actuator, limited so that an explicit step is stable.
+    """Return the bristle stiffness of an actuator, limited for a stable explicit step [N/m] or [N m/rad].
 
-    The limit is 0.5 inertia / dt^2; an inertia or time step of 0 means no limit.
+    The limit is 0.5 inertia / dt^2, with the inertia that the drive moves and the time step dt. An
+    inertia or time step of 0 means no limit.
     """
     stiffness = user[u + _BRISTLE_STIFFNESS]
     if inertia > 0.0 and dt > 0.0:
@@ -300,7 +309,7 @@ def bristle_rate(user, u, fraction, velocity, inertia, dt):
     The state r is the elastic bristle force divided by the breakaway force.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r at the start of the step, scalar [1].
         velocity: velocity of the drive over the step, scalar [m/s] or [rad/s].
@@ -331,11 +340,12 @@ def bristle_friction(user, u, fraction, velocity, inertia, dt):
     `t = tanh(v/v_0)`.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: v, scalar [m/s] or [rad/s].
-        inertia: inertia moved by the drive, see `bristle_rate`.
+        inertia: inertia J moved by the drive, scalar [kg] or [kg m^2]. The bristle stiffness is
+            limited to 0.5 J / dt^2 and the bristle damping to 0.5 J / dt; 0 means no limit.
         dt: time step, scalar [s]; 0 means no limit of stiffness and damping.
 
     Returns:
@@ -366,7 +376,7 @@ def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia,
     Only this friction, taken at the new velocity, and `other_force` act on the body.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: at the start of the step, scalar [m/s] or [rad/s].
@@ -375,7 +385,7 @@ def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia,
         dt: time step, scalar [s], > 0.
 
     Returns:
-        F, scalar [N] or [N m].
+        F, friction at the end of the step, scalar [N] or [N m].
 
     Source: linearly implicit Euler rule.
     """

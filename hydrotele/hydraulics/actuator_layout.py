@@ -19,11 +19,12 @@ CURVE_KNOTS = 8  # largest number of knots of a valve's flow curve in one direct
 class Slot(enum.IntEnum):
     """Indices of an actuator's parameters in `actuator_user`, all in SI units.
 
-    For optional effects, 0 disables the effect (for metering ratios, 1 does). BRISTLE, DELIVERY and
-    ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis. EXTRA_STATES is the
-    number of additional activations after those of the hydraulic axes (see `extra_state_names`).
-    CURVES, the last, is the start of two flow curves, for the positive and the negative direction.
-    Each has the number of knots (0: linear), CURVE_KNOTS travels and CURVE_KNOTS openings.
+    For optional effects, the value 0 disables the effect (for metering ratios, 1 does). BRISTLE,
+    DELIVERY and ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis.
+    EXTRA_STATES is the number of additional activations after those of the hydraulic axes (see
+    `extra_state_names`). CURVES, the last, is the start of two flow curves, for the positive and
+    the negative direction. Each has the number of knots (0: linear), CURVE_KNOTS travels and
+    CURVE_KNOTS openings.
     """
 
     @staticmethod
@@ -226,9 +227,10 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
 
 
 def machine_terms_table(machine: Machine) -> np.ndarray:
-    """Return the additional force and flow laws (terms) of a machine as an array for compiled code.
+    """Encode the terms (additional force, flow and command laws) of a machine for compiled code.
 
-    See `terms.table.encode_terms_table` for its layout.
+    See `terms.table.encode_terms_table` for the layout of the array (n,), which is empty without
+    terms.
     """
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
@@ -393,7 +395,10 @@ def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> No
 
 
 def _write_counterbalance(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
-    """Write setting, pilot ratio and override pressure of a counterbalance valve to the slots from `first` on."""
+    """Write setting, pilot ratio and override pressure of a counterbalance valve to three slots.
+
+    `first` is the index of the first of these slots. Without a valve nothing is written.
+    """
     if valve:
         override = valve.override * valve.setting
         numbers[first : first + 3] = valve.setting, valve.pilot_ratio, override

@@ -4,8 +4,8 @@ Pure functions on flat arrays in MuJoCo's layout, so that the native callbacks, 
 estimator run the same code. The parameters of axis `i` are at `user[i * SLOT_COUNT + Slot]`. Its
 activations `spool, spool_rate, p_head, p_rod` are at `act[4 i ...]`, counted from the first
 hydraulic axis. The states of bristles, of a pump with a time constant and of terms follow after all
-axes. An axis with its own pump (`ActuatorKind.PUMP_DRIVE`, see `pump`) has pump speed and load cylinder
-pressure instead of spool and spool rate.
+axes. An axis with its own pump (`ActuatorKind.PUMP_DRIVE`, see `pump_drive`) has pump speed and
+load cylinder pressure instead of spool and spool rate.
 
 The module also evaluates the terms of a machine in a step, and the implicit friction of a light
 drive side, for which an explicit step would oscillate about rest.
@@ -128,19 +128,20 @@ def _chamber_stiffness(user, u, x, p_head, p_rod):
 
 @compile_inlined
 def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
-    """Return the pressure rates of both chambers of an axis, and their slopes.
+    """Return the pressure rates of both chambers of an axis, and their derivatives.
 
     `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`
-    with bulk modulus beta, volumes V, valve flows q, areas A, piston leakage q_l, and flows r of port
-    relief, make-up valve and terms. A hose of compliance C_h counts as additional volume `beta C_h`, and
-    air bubbles in the oil as beta times their compliance (`laws.air_compliance`). Beyond an end of the
-    stroke the volumes are constant. The rates are those without released air; `laws.pressure_with_released_air`
-    converts pressures below atmosphere.
+    with bulk modulus beta, volumes V, valve flows q, areas A, piston leakage q_l, and flows r of
+    port relief, make-up valve and terms. A hose of compliance C_h counts as additional volume
+    `beta C_h`, and air bubbles in the oil as beta times their compliance (`laws.air_compliance`).
+    Beyond an end of the stroke the volumes are constant. The rates are those without released air;
+    `laws.pressure_with_released_air` converts pressures below atmosphere.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
-        opening: signed valve opening, scalar [1]; for an axis with its own pump the pump speed [rad/s].
+        opening: signed valve opening, scalar [1]; for an axis with its own pump the pump speed
+            [rad/s].
         p_supply: supply pressure, scalar [Pa].
         p_head: head-side pressure p_A, scalar [Pa].
         p_rod: rod-side pressure p_B, scalar [Pa].
@@ -148,8 +149,8 @@ def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahea
         v: piston velocity, scalar [m/s] or [rad/s].
         ahead: time over which the slopes are used, scalar [s]: a relief or make-up valve that
             would open within it counts as open in the slope (not in the rate).
-        added: flows of the machine's terms into both chambers [m^3/s] and their slopes with
-            respect to the pressures of these chambers [m^3/(s Pa)], see `terms.table.sum_flow_terms`.
+        added: flows of the machine's terms into both chambers [m^3/s] and their slopes with respect
+            to the pressures of these chambers [m^3/(s Pa)], see `terms.table.sum_flow_terms`.
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
@@ -183,7 +184,9 @@ def chamber_pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahea
 def _term_flows(terms, i, user, time, x, oil, supply, drives):
     """Return the flows that a machine's terms (additional laws) add to the chambers of axis i.
 
-    `oil` contains spool, spool rate and both pressures of the axis, and x is its position.
+    `oil` is (spool [1], spool rate [1/s], head-side pressure, rod-side pressure [Pa]) of the axis,
+    and x its position [m] or [rad]. `supply` is the supply pressure [Pa]; velocities and commands
+    are those of `drives`.
 
     Returns:
         (flow into head side, into rod side [m^3/s], their slopes with respect to the pressures of
@@ -202,8 +205,8 @@ def _term_flows(terms, i, user, time, x, oil, supply, drives):
 def _term_flow_fraction(user, first, drives, terms, time, supply, dt):
     """Return the flow that terms add to the supply at the end of a step, per maximum pump flow [1].
 
-    Terms are additional laws of a machine. The flow follows their sum at the start of the step with a
-    first-order lag.
+    Terms are additional laws of a machine. The flow follows the sum of the terms at the start of
+    the step with a first-order lag of 20 ms. It is 0 for a machine without such terms.
     """
     at = int(user[first * SLOT_COUNT + _ADDED])
     if at == 0:
@@ -224,32 +227,35 @@ def _term_flow_fraction(user, first, drives, terms, time, supply, dt):
 
 @compile_without_allocation
 def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_states):
-    """Advance spools (or pump speeds) and chamber pressures of all hydraulic axes by one time step.
+    """Compute the mean rates of spools (or pump speeds) and chamber pressures over a time step.
+
+    The activations themselves are not changed; adding dt times the rates advances them by the step.
 
     Spools follow their exact exponential. Pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
-    except for the supply, which couples all fed chambers (`compute_supply_pressure_derivatives`, solved by the
-    Sherman-Morrison formula). The supply pressure is solved in both stages. Below atmosphere the
-    method integrates the pressure P without released air (`laws.pressure_without_released_air`), which is
-    linear in the missing oil volume. A pump with a time constant follows the mean of the flow
-    demands at both ends of the step, by its exact exponential.
+    except for the supply, which couples all fed chambers (`compute_supply_pressure_derivatives`,
+    solved by the Sherman-Morrison formula). The supply pressure is solved in both stages. Below
+    atmosphere the method integrates the pressure P without released air
+    (`laws.pressure_without_released_air`), which is linear in the missing oil volume. A pump with a
+    time constant follows the mean of the flow demands at both ends of the step, by its exact
+    exponential.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         drives: Drives: number of hydraulic actuators, <= MAX_AXES; their spool [1], spool rate
             [1/s] and pressures [Pa] at the start of the step, followed by the additional states of
-            `parameters.extra_state_names`. For all actuators: positions at the end of the step, as
-            in MuJoCo's leapfrog [m] or [rad], velocities during the step [m/s] or [rad/s], and
-            commands, which are clipped to [-1, 1] [1].
+            `actuator_layout.extra_state_names`. For all actuators: positions at the end of the
+            step, as in MuJoCo's leapfrog [m] or [rad], velocities during the step [m/s] or [rad/s],
+            and commands, which are clipped to [-1, 1] [1].
         dt: time step, scalar [s].
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
             [s]; of the additional states only those of the pump.
         scratch: (SCRATCH_SIZE,) work space.
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: time at the start of the step, scalar [s]; used by terms only.
-        extra_states: number of additional states after the activations, scalar [1]; `NO_EXTRA_STATES` skips
-            them and saves the time of the check.
+        extra_states: number of additional states after the activations, scalar [1];
+            `NO_EXTRA_STATES` skips them and saves the time of the check.
 
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
@@ -351,12 +357,13 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
 
 @compile_without_allocation
 def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
-    """Write the rates of the internal states of terms with hysteresis over a step.
+    """Write the mean rates over a step of the internal states of terms with hysteresis.
 
-    It must be called after the rates of all other activations are written.
+    Call this function after the rates of all other activations have been written, since it uses
+    them.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
@@ -399,10 +406,10 @@ def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
 
 @compile_without_allocation
 def _relief_limited_rate(margin, rate, relief_rate, dt):
-    """Return the mean pressure rate over a step in which a port relief valve opens [Pa/s].
+    """Return the mean pressure rate over a step in which the port relief valve opens [Pa/s].
 
-    For a valve that is closed in both stages of the method. The pressure rises with the rate r up
-    to the setting; from there the excess e follows `e' = r - e q`.
+    The function is used if the pressure passes the setting within the step. The pressure rises with
+    the rate r up to the setting; from there the excess e over the setting follows `e' = r - e q`.
 
     Args:
         margin: pressure difference up to the setting, scalar [Pa].
@@ -419,8 +426,8 @@ def _relief_limited_rate(margin, rate, relief_rate, dt):
 def _rate_with_air(user, u, pressure, rate, dt):
     """Convert a mean pressure rate of oil without released air to that with released air [Pa/s].
 
-    `pressure` is the chamber pressure with air at the start of the step. Only pressures below
-    atmosphere are affected.
+    `pressure` is the chamber pressure with air at the start of the step of length dt. The rate is
+    unchanged if the pressure is above atmosphere at both ends of the step.
     """
     release, onset = user[u + _AIR], user[u + _ONSET]
     if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
@@ -431,9 +438,10 @@ def _rate_with_air(user, u, pressure, rate, dt):
 
 @compile_inlined
 def _predicted_softening(user, u, pressure, rate, dt):
-    """Return the factor by which released air reduces the pressure slopes of a chamber in a step [1].
+    """Return the factor by which released air reduces the derivatives of a pressure rate [1].
 
-    It is 1 above atmosphere, and also if the step would refill the chamber. `rate` is the pressure rate
+    It is `laws.air_softening_factor` at the start of the step. It is 1 if the chamber `pressure`
+    [Pa] is above atmosphere at the start, or would be above at the end. `rate` is the pressure rate
     without released air [Pa/s].
     """
     release, onset = user[u + _AIR], user[u + _ONSET]
@@ -493,19 +501,21 @@ def _apply_supply_coupling(count, rate, scratch):
 
 @compile_without_allocation
 def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
-    """Return the flows into both chambers and the force of one axis in a state, for logs and balances.
+    """Return the flows into both chambers and the force of one axis in a given state.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         i: index of the actuator.
         supply: supply pressure, scalar [Pa].
-        act: (4,) spool [1], spool rate [1/s], head-side and rod-side pressure [Pa].
+        act: (4,) spool [1], spool rate [1/s], head-side and rod-side pressure [Pa]. For an axis
+            with its own pump the first two are pump speed [rad/s] and load pressure [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
         bristle_fraction: fraction of the breakaway force that the bristles carry, scalar [1].
 
     Returns:
-        (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]).
+        (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]). The flows are those of
+        the valve or pump, without port relief, piston leakage and terms.
 
     Source: models/cat215/README.md, "Orifice" and "Force".
     """
@@ -535,11 +545,11 @@ _RELATIVE_TOLERANCE = 1.0e-13
 def implicit_friction(user, u, velocity, other_force, inertia, dt):
     """Return the friction on a body at the end of an implicit time step, without bristles.
 
-    Only the friction F_f of the actuator and the force F act on the body. The function
-    solves `v' = v + dt / J (F - F_f(v'))` for the velocity v' at the end by Newton's method in a bracket.
+    Only the friction F_f of the actuator and the force F act on the body. The function solves
+    `v' = v + dt / J (F - F_f(v'))` for the velocity v' at the end by Newton's method in a bracket.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: v at the start of the step, scalar [m/s] or [rad/s].
         other_force: F, all other force, scalar [N] or [N m].
@@ -577,22 +587,25 @@ _OFFSET = int(Slot.OFFSET)
 
 @compile_without_allocation
 def make_drive_state(user, i, count, act, supply, time, x, v, command, gain):
-    """Collect the state of one drive, which is the input of the laws of terms.
+    """Return the state of one drive, which is the input of the laws of terms.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         i: index of the actuator.
         count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) spool [1], spool rate [1/s] and two pressures [Pa] of every hydraulic axis.
+        act: (>= 4 count,) spool [1], spool rate [1/s] and two pressures [Pa] of every hydraulic
+            axis.
         supply: supply pressure, scalar [Pa].
         time: scalar [s].
         x: position of the drive, scalar [m] or [rad].
         v: its velocity, scalar [m/s] or [rad/s].
         command: command after its delay, scalar [1] or [V].
-        gain: force per command of a force drive, scalar [N/V] or [N m/V].
+        gain: force per unit of command of a force drive, scalar [N/V] or [N m/V]; not used for
+            others.
 
     Returns:
-        DriveState [SI].
+        DriveState [SI]. The force is that before friction; the outputs of a backlash operator are
+        0.
 
     Source: docs/effects.md, "The law".
     """
@@ -606,13 +619,15 @@ def make_drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
 @compile_without_allocation
 def add_command_terms(user, terms, drives, dt, time, scratch, out):
-    """Add those terms (additional laws) of a machine that change commands to the commands of the valves.
+    """Compute the commands of the hydraulic axes plus the terms that add to commands.
 
-    The terms are evaluated with positions and time at the middle of the step, and with spools and pressures
-    at its start; their effect on a command is therefore late by half a step.
+    Terms are additional laws of a machine.
+
+    The terms are evaluated with positions and time at the middle of the step, and with spools and
+    pressures at its start; their effect on a command is therefore late by half a step.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         terms: (n,) table of terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].

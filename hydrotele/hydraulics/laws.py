@@ -38,14 +38,15 @@ def valve_opening(spool, deadband):
 
 @compile_inlined
 def orifice_flow(pressure_drop, flow_gain, smoothing):
-    """Return the turbulent orifice flow, smooth at zero pressure drop, and its slope.
+    """Return the turbulent flow through an orifice, smooth at zero pressure drop, and its derivative.
 
     `q = k dp / (dp^2 + d^2)^(1/4)`, which is `k sgn(dp) sqrt(|dp|)` away from zero.
 
     Args:
         pressure_drop: dp, scalar [Pa].
-        flow_gain: k = Q_rated |o| / sqrt(dp_rated) with the relative valve opening o, scalar [m^3/(s sqrt(Pa))].
-        smoothing: d, scalar [Pa], > 0.
+        flow_gain: k = Q_rated |o| / sqrt(dp_rated) with the relative valve opening o, scalar
+            [m^3/(s sqrt(Pa))].
+        smoothing: d, pressure drop below which the root is smoothed, scalar [Pa], > 0.
 
     Returns:
         (flow q [m^3/s] with the sign of the pressure drop, slope dq/d(dp) [m^3/(s Pa)] > 0).
@@ -66,10 +67,10 @@ def orifice_flow(pressure_drop, flow_gain, smoothing):
 
 @compile_inlined
 def relief_and_makeup_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
-    """Return the flow into a chamber through its port relief valve and make-up valve, and its slope.
+    """Return the flow into a chamber through port relief and make-up valve, and its derivative.
 
-    `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`. The relief valve limits the pressure, and the
-    make-up valve refills the chamber from the tank.
+    `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`. The relief valve limits the pressure, and
+    the make-up valve refills the chamber from the tank.
 
     Args:
         pressure: chamber pressure p, scalar [Pa].
@@ -177,13 +178,14 @@ def pressure_without_released_air(pressure, release, onset=0.0):
 
 @compile_inlined
 def air_softening_factor(pressure, release, onset=0.0):
-    """Return the factor by which air released below atmosphere softens the oil in a chamber.
+    """Return the factor by which air released below atmosphere reduces the stiffness of oil.
 
-    It is the derivative of the pressure p with released air by the pressure P without it.
+    The factor is the derivative of the pressure p with released air by the pressure P without it.
 
     Args:
         pressure: p, scalar [Pa] above atmosphere.
-        release: R of `pressure_with_released_air`: dissolved air fraction times bulk modulus, scalar [Pa].
+        release: R of `pressure_with_released_air`: dissolved air fraction times bulk modulus,
+            scalar [Pa].
         onset: pressure deficit at which the release starts, scalar [Pa].
 
     Returns:
@@ -204,7 +206,7 @@ def air_softening_factor(pressure, release, onset=0.0):
 
 @compile_without_allocation
 def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
-    """Return the relative opening of a counterbalance valve, and its slope.
+    """Return the relative opening of a counterbalance valve, and its derivative by the pressure.
 
     `(p + R p_pilot - p_set) / p_o`, limited to 0 .. 1. The valve holds a load until the pressure of
     the opposite chamber opens it. Flow into the chamber passes the valve's
@@ -237,7 +239,7 @@ def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
 
 @compile_without_allocation
 def end_stop_force(position, velocity, low, high, stiffness, damping):
-    """Return the force of an end stop, a spring and a damper that only push, and its slopes.
+    """Return force, stiffness and damping of an end stop, a spring and a damper that only push.
 
     `F = max(0, k (x_low - x) - c v)` below the lower end, `-max(0, k (x - x_high) + c v)` above the
     upper one, 0 between.
@@ -344,7 +346,7 @@ def friction_slope(
 
 @compile_without_allocation
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
-    """Advance position and speed of a valve spool by one time step of its second-order dynamics.
+    """Return position and speed of a valve spool after one time step of its second-order dynamics.
 
     `s'' = w^2 (u - s) - 2 z w s'` with `|s'| <= s_max`, where ' is d/dt. The command is constant
     over the step. The exponential is truncated after the fourth power of `w dt`: for z <= 1 the

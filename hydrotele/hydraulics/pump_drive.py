@@ -41,17 +41,19 @@ _LOAD_FRICTION, _LOAD_RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETUR
 
 @compile_without_allocation
 def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
-    """Return the pump speed after a step, signed by the side that the valve selects.
+    """Return the pump speed after a time step, signed by the side that the valve selects.
 
-    `J w' = k (u U - k w) / R - D dp - l |D dp| - T_c - T_s exp(-(w/w_s)^2) - b w`, with speed w >= 0,
-    inertia J, torque constant k, duty cycle u, voltage U, resistance R, displacement D, pressure rise
-    dp, torque loss l, drag T_c, breakaway torque T_s that decays at w_s, and viscous drag b. The
-    current is quasi-static, because `L/R` is shorter than the time scale of the speed. `b w` and
-    `k^2 w / R` are taken at the end of the step. Without a motor the speed is the command times the
-    rated speed.
+    A positive command and speed feed the head side.
+
+    `J w' = k (u U - k w) / R - D dp - l |D dp| - T_c - T_s exp(-(w/w_s)^2) - b w`, with the
+    unsigned speed w, inertia J, torque constant k, duty cycle u, voltage U, resistance R,
+    displacement D, pressure rise dp, torque loss l, drag T_c, breakaway torque T_s that decays at
+    w_s, and viscous drag b. The current is quasi-static, because `L/R` is shorter than the time
+    scale of the speed. `b w` and `k^2 w / R` are taken at the end of the step. Without a motor the
+    speed is the command times the rated speed.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         p: index of the pump parameters of this axis in `user`.
         speed: signed speed at the start, scalar [rad/s].
         command: u, signed by the side, scalar [1].
@@ -134,14 +136,14 @@ def accumulator_pressure(pressure, gas_volume, removed_volume):
 
 @compile_without_allocation
 def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
-    """Return the flows of pump and accumulator line into both chambers, and their slopes.
+    """Return the flows of pump and accumulator line into both chambers, and their derivatives.
 
-    The pump moves `D w - k dp` from one line to the other, with displacement D, speed w, leakage k and
-    pressure rise dp. The accumulator at pressure p_a adds `(p_a - p) / R` through the resistance R to
-    the line at pressure p that the pump draws from.
+    The pump moves `D w - k dp` from one line to the other, with displacement D, speed w, leakage k
+    and pressure rise dp. The accumulator at pressure p_a adds `(p_a - p) / R` through the
+    resistance R to the line at pressure p that the pump draws from.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         p: index of the pump parameters of this axis in `user`.
         speed: pump speed, positive if it feeds the head side, scalar [rad/s]; 0: valve closed.
         p_head: head-side pressure, scalar [Pa].
@@ -192,13 +194,14 @@ def chamber_compliance(volume, bulk_modulus, compliance, air, pressure):
 
 @compile_without_allocation
 def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
-    """Return the pressure rates of both chambers of a pump drive, and their slopes.
+    """Return the pressure rates of both chambers of a pump drive, and their derivatives.
 
-    `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B` with compliances C, flows q
-    of pump and accumulator, areas A, piston velocity v, piston leakage q_l, and flows a of terms.
+    `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B` with compliances C,
+    flows q of pump and accumulator, areas A, piston velocity v, piston leakage q_l, and flows a of
+    terms.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         p: index of the pump parameters of this axis in `user`.
         speed: pump speed, positive if it feeds the head side, scalar [rad/s].
         p_head: head-side pressure p_A, scalar [Pa].
@@ -237,7 +240,7 @@ def load_pressure_step(user, p, pressure, velocity, dt):
     pressure `p_s + r A max(0, v)`, with setting p_s, override r and piston area A.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         p: index of the pump parameters of this axis in `user`.
         pressure: p at the start, scalar [Pa].
         velocity: v, positive against the load, scalar [m/s].
@@ -281,13 +284,14 @@ def load_cylinder_force(user, p, pressure):
 def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """Return the friction of a pump drive's piston at the end of a step, including sticking.
 
-    The dry friction is `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder
-    retracts. m is the friction coefficient of the load cylinder, A its area and F_r its return force. If
-    the dry friction can make the velocity after the step, `v + dt/M (F - F_f)`, zero, it does. With dt = 0 the
-    friction is that at the current velocity; at rest it balances F as far as possible.
+    Dry friction adds to viscous friction with the coefficient b. The dry friction is
+    `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder retracts. m is the
+    friction coefficient of the load cylinder, A its area and F_r its return force. If the dry
+    friction can make the velocity after the step, `v + dt/M (F - F_f)`, zero, it does. With dt = 0
+    the friction is that at the current velocity; at rest it balances F as far as possible.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         p: index of the pump parameters of this axis in `user`.
         seal: seal friction (F_c, F_s [N], v_s [m/s], b [N s/m], asymmetry of F_c + F_s, asymmetry
             of b [1]).

@@ -96,17 +96,18 @@ def solve_supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0,
 
 @compile_inlined
 def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate):
-    """Compute the valve opening, inlet gain and fed chamber pressure of every axis.
+    """Write valve opening, inlet gain and fed chamber pressure of every axis to `ports`.
 
-    They are written to `ports`, from which the functions of this module compute the supply pressure.
+    The functions of this module compute the supply pressure from `ports`.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
-        act: (4 count,) activations; of each axis only the pressures at indices 2 and 3 are read [Pa].
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
+        act: (4 count,) activations; of each axis only the pressures at indices 2 and 3 are read
+            [Pa].
         spool: (4 count,) array with the spool position of every axis at index 0 of its four [1].
-        ports: (>= 4 count,) written, four values per axis: inlet gain [m^3/(s sqrt(Pa))], fed chamber
-            pressure [Pa], pressure drop set by the compensator [Pa], opening [1]. The last is the pump
-            speed [rad/s] for an axis with its own pump.
+        ports: (>= 4 count,) written, four values per axis: inlet gain [m^3/(s sqrt(Pa))], fed
+            chamber pressure [Pa], pressure drop set by the compensator [Pa], opening [1]. The last
+            is the pump speed [rad/s] for an axis with its own pump.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ahead: time by which the pressures are extrapolated with `rate`, scalar [s].
@@ -135,13 +136,14 @@ def compute_inlet_conditions(user, act, spool, ports, first, count, ahead, rate)
 def delivered_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump delivers, including the flow that terms add.
 
-    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant and terms.
+    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant and
+    terms.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
-        act: (>= 4 count + EXTRA_STATES,) activations; DELIVERY is read if the pump has a time constant,
-            ADDED_DELIVERY if terms add to the flow [1].
+        act: (>= 4 count + EXTRA_STATES,) activations; DELIVERY is read if the pump has a time
+            constant, ADDED_DELIVERY if terms add to the flow [1].
 
     Returns:
         Fraction, scalar [1].
@@ -158,11 +160,11 @@ def delivered_flow_fraction(user, first, act):
 def pump_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump delivers, without the flow that terms add.
 
-    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant;
-    otherwise it is a state of the simulation.
+    Terms are additional laws of a machine. The fraction is 1 for a pump without time constant.
+    Otherwise it is a state of the simulation, limited to 1e-6 .. 1.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         act: (>= 4 count + EXTRA_STATES,) activations [1].
 
@@ -179,7 +181,9 @@ def pump_flow_fraction(user, first, act):
 
 @compile_without_allocation
 def add_flow_fractions(fraction, added):
-    """Add to a pump's flow fraction that of the machine's terms (additional laws), bounded below by > 0.
+    """Return the sum of a pump's flow fraction and the fraction that terms (additional laws) add.
+
+    The sum is at least 1e-6, so that the supply pressure is unique.
 
     Args:
         fraction: flow fraction without terms, scalar [1].
@@ -195,12 +199,13 @@ def add_flow_fractions(fraction, added):
 
 @compile_without_allocation
 def advance_pump_flow_fraction(user, first, demanded, fraction, dt):
-    """Return the flow fraction of a pump with first-order lag after a time, by the exact exponential.
+    """Return the flow fraction of a pump with first-order lag after a duration (exact exponential).
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
-        demanded: fraction of the maximum flow that the valves demand, constant over the time, scalar [1].
+        demanded: fraction of the maximum flow that the valves demand, constant over the time,
+            scalar [1].
         fraction: delivered fraction at the start, scalar [1].
         dt: duration, scalar [s].
 
@@ -217,17 +222,19 @@ def advance_pump_flow_fraction(user, first, demanded, fraction, dt):
 def demanded_flow_fraction(user, first, count, ports):
     """Return the fraction of the maximum pump flow that the valves demand.
 
-    `q = (sum_i q_i + c_p p_s) / Q_pump` with valve flows q_i, pump leakage c_p and maximum flow Q_pump,
-    at the pressure p_s that a pump without time constant would maintain. A pump with time constant T
-    delivers at most the fraction r with `T dr/dt = q - r`. While r rises, the pressure drops until the
-    valves draw no more than that. While r falls, the excess flow passes the relief or unloading valve.
+    `q = (sum_i q_i + c_p p_s) / Q_pump` with valve flows q_i, pump leakage c_p and maximum flow
+    Q_pump, at the pressure p_s that a pump without time constant would maintain. A pump with time
+    constant T delivers at most the fraction r with `T dr/dt = q - r`. While r rises, the pressure
+    drops until the valves draw no more than that. While r falls, the excess flow passes the relief
+    or unloading valve.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
-            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
+            pressure drop set by the compensator [Pa] and opening [1] of every axis, see
+            `compute_inlet_conditions`.
 
     Returns:
         q, scalar [1], 0 .. 1.
@@ -243,11 +250,12 @@ def drawn_flow(user, first, count, ports, supply):
     """Return the flow that all valves and the pump's internal leakage draw at a supply pressure.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
-            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
+            pressure drop set by the compensator [Pa] and opening [1] of every axis, see
+            `compute_inlet_conditions`.
         supply: p_s, scalar [Pa].
 
     Returns:
@@ -266,19 +274,21 @@ def drawn_flow(user, first, count, ports, supply):
 
 @compile_inlined
 def max_supply_pressure(user, first, count, ports):
-    """Return the upper limit of the supply pressure: the setting of the relief valve.
+    """Return the upper limit of the supply pressure, without the override of the relief valve.
 
-    For a load-sensing pump it is at most the largest fed chamber pressure (or tank pressure) plus the margin.
+    It is the setting of the relief valve. For a load-sensing pump it is the smaller of this setting
+    and the largest pressure of a fed chamber (or the tank pressure) plus the margin.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
-            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
+            pressure drop set by the compensator [Pa] and opening [1] of every axis, see
+            `compute_inlet_conditions`.
 
     Returns:
-        p_s, scalar [Pa].
+        Pressure, scalar [Pa].
 
     Source: `circuit_supply_pressure`.
     """
@@ -295,17 +305,18 @@ def max_supply_pressure(user, first, count, ports):
 
 @compile_inlined
 def circuit_supply_pressure(user, first, count, ports, fraction):
-    """Compute the supply pressure of a circuit from pump, relief valve and load sensing.
+    """Compute the supply pressure of a circuit from pump, valves, relief valve and load sensing.
 
     A load-sensing pump maintains `max p_i + margin` over the open valves (tank pressure counts as a
     load), within the limits of relief setting and flow.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
-            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
+            pressure drop set by the compensator [Pa] and opening [1] of every axis, see
+            `compute_inlet_conditions`.
         fraction: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
@@ -321,7 +332,7 @@ def circuit_supply_pressure(user, first, count, ports, fraction):
 
 @compile_without_allocation
 def compute_supply_pressure_derivatives(user, first, count, ports, supply, out):
-    """Compute the derivatives of the supply pressure with respect to the fed chamber pressures.
+    """Write the derivatives of the supply pressure by the pressures of the fed chambers to `out`.
 
     `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` if the pump flow limits the pressure. It is 1 for the
     largest load if load sensing maintains its margin, 0 at the relief setting, or
@@ -329,11 +340,12 @@ def compute_supply_pressure_derivatives(user, first, count, ports, supply, out):
     derivative of an inlet's flow with respect to its pressure drop.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa], pressure drop
-            set by the compensator [Pa] and opening [1] of every axis, see `compute_inlet_conditions`.
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
+            pressure drop set by the compensator [Pa] and opening [1] of every axis, see
+            `compute_inlet_conditions`.
         supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].

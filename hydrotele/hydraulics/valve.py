@@ -26,7 +26,7 @@ def axis_valve_opening(user, u, spool):
     linear between its knots and is extrapolated beyond the last one. Without a curve `o = t`.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
         spool: spool position s, scalar [1].
 
@@ -55,12 +55,13 @@ def inlet_gain(user, u, opening):
     """Return the flow gain of the metering edge that feeds a chamber.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
         opening: o, signed valve opening, scalar [1].
 
     Returns:
-        Flow per root of the pressure drop of the edge P-A (o > 0) or P-B, scalar [m^3/(s sqrt(Pa))].
+        Flow per root of the pressure drop of the edge P-A (o > 0) or P-B, scalar
+        [m^3/(s sqrt(Pa))].
 
     Source: models/cat215/README.md, "Orifice".
     """
@@ -70,7 +71,7 @@ def inlet_gain(user, u, opening):
 
 @compile_inlined
 def inlet_flow(drop, gain, smoothing, compensated):
-    """Return the flow through an inlet edge, which can be pressure-compensated, and its slope.
+    """Return the flow through an inlet edge, which can be pressure-compensated, and its derivative.
 
     Args:
         drop: pressure drop, scalar [Pa], > 0.
@@ -94,10 +95,11 @@ def inlet_flow(drop, gain, smoothing, compensated):
 
 @compile_inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
-    """Return the flow out of a chamber through the valve's open edge to tank, and its slope.
+    """Return the flow out of a chamber through the valve's open edge to tank, and its derivative.
 
-    `gain` is that of the edge, `holding` the slot of the chamber's counterbalance valve, and `pilot` the
-    pressure of the opposite chamber [Pa].
+    `gain` is the flow gain of the edge [m^3/(s sqrt(Pa))], and `holding` the slot with the setting
+    of the chamber's counterbalance valve. `pressure` is that of the chamber and `pilot` that of the
+    opposite chamber [Pa].
 
     Returns:
         (flow [m^3/s], its derivative by the chamber pressure [m^3/(s Pa)]).
@@ -108,9 +110,10 @@ def _outlet_flow(user, u, holding, gain, pressure, pilot):
 
 @compile_inlined
 def _tank_leakage(user, u, holding, pressure, pilot):
-    """Return the leakage out of a chamber through the spool's clearance to tank, and its slope.
+    """Return the leakage from a chamber through the spool's clearance to tank, and its derivative.
 
-    The arguments and units are those of `_outlet_flow`.
+    Arguments and result are those of `_outlet_flow`. The counterbalance valve of the chamber
+    reduces the leakage.
     """
     leak = user[u + _TANK_LEAK]
     flow = leak * (pressure - user[u + _TANK])
@@ -119,9 +122,11 @@ def _tank_leakage(user, u, holding, pressure, pilot):
 
 @compile_inlined
 def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
-    """Reduce a flow to tank, and its slope, by the opening of the chamber's counterbalance valve.
+    """Return a flow from a chamber to tank, and its derivative, reduced by the counterbalance valve.
 
-    Without such a valve, or for flow into the chamber, both are returned unchanged.
+    The flow [m^3/s] is multiplied by the valve's relative opening; `slope` is its derivative by the
+    chamber pressure [m^3/(s Pa)]. Without a counterbalance valve, or for flow into the chamber,
+    both are returned unchanged. The other arguments are those of `_outlet_flow`.
     """
     if user[u + holding] == 0.0 or flow <= 0.0:
         return flow, slope
@@ -133,7 +138,7 @@ def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
 
 @compile_inlined
 def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
-    """Return the valve flows into both chambers of an axis, and their slopes.
+    """Return the valve flows into both chambers of an axis, and their pressure derivatives.
 
     With o > 0 the head side is fed through its load check and the rod side drains to tank; with
     o < 0 vice versa. From each chamber oil leaks to tank through the spool's radial clearance,
@@ -144,7 +149,7 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     into a chamber is not modelled.
 
     Args:
-        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         u: index of the first parameter of this axis in `user`.
         opening: o, signed valve opening, scalar [1].
         p_supply: supply pressure, scalar [Pa].
@@ -154,7 +159,8 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
 
-    Source: models/cat215/README.md, "Orifice"; Merritt 1967, laminar flow through an annular clearance.
+    Source: models/cat215/README.md, "Orifice"; Merritt 1967, laminar flow through an annular
+    clearance.
     """
     q_head, q_rod, slope_head, slope_rod = _edge_flows(user, u, opening, p_supply, p_head, p_rod)
     if user[u + _TANK_LEAK] == 0.0:

@@ -22,10 +22,10 @@ _SIGNED_FRICTION_SUFFIXES = ("asymmetry",)  # friction that may have either sign
 
 @dataclass(frozen=True)
 class ConsistentParameters:
-    """Physically consistent parameters.
+    """Inertial and friction parameters that are physically consistent (positive masses, dissipation).
 
     Attributes:
-        value: (m,) parameters in the order of the identification.
+        value: (m,) parameters in the order of `Identification.names`.
         squared_distance: squared Mahalanobis distance of their base parameters from the estimate. It is about
             the number of base parameters if the estimate is consistent within its noise.
     """
@@ -36,7 +36,7 @@ class ConsistentParameters:
 
 @dataclass(frozen=True)
 class AllowedDeformation:
-    """Allowed deformation of a body.
+    """Allowed changes of a body's mass distribution relative to the given one.
 
     Attributes:
         can_rotate_axes: whether the principal axes may rotate.
@@ -52,11 +52,14 @@ def find_consistent_parameters(
 ) -> ConsistentParameters:
     """Find the physically consistent parameters that fit an identification best.
 
-    Masses are positive, inertias belong to a mass distribution, and friction dissipates energy.
+    Masses are positive, inertias belong to a mass distribution, and friction dissipates energy. The
+    parameters minimise the squared Mahalanobis distance of their base parameters from the estimate,
+    plus squared deformations of the bodies over a standard deviation of 0.3.
 
     Args:
         found: the identification; its given bodies must have mass.
-        deformations: body -> allowed deformation; unrestricted by default.
+        deformations: body -> allowed deformation of its given mass distribution; unrestricted by
+            default.
 
     Returns:
         The parameters.
@@ -117,9 +120,11 @@ class _DeformableBody:
         self.variable_count = 4 + len(self.shift_directions) + (3 if freedom.can_rotate_axes else 0)
 
     def inertial_parameters(self, x: np.ndarray) -> np.ndarray:
-        """Return mass, moments and inertia (10,) of the body deformed by the variables x.
+        """Return mass, first moments and inertia (10,) of the body deformed by the variables x.
 
-        x holds the logarithms of four scales, the shift of the centre of mass and, if allowed, shear.
+        x holds the logarithms of four scales (three axes and the root of the mass), the shift of the
+        centre of mass over the RMS distance of the given mass from the frame's origin, and three
+        shears if the principal axes may rotate.
         """
         shift = self.scale * x[4 : 4 + len(self.shift_directions)] @ self.shift_directions
         deform = np.diag(np.exp(x[:4]))
@@ -130,7 +135,7 @@ class _DeformableBody:
 
 
 def _to_pseudo_inertia(p: np.ndarray) -> np.ndarray:
-    """Convert inertial parameters (10,) to the pseudo-inertia (4, 4).
+    """Convert inertial parameters (10,) (mass, first moments, inertia) to the pseudo-inertia (4, 4).
 
     This matrix holds second moments, first moments and mass; it is positive definite for any real body.
     """
@@ -150,7 +155,10 @@ def _from_pseudo_inertia(pseudo: np.ndarray) -> np.ndarray:
 
 
 def _add_min_extent(pseudo: np.ndarray) -> np.ndarray:
-    """Return a pseudo-inertia with some extent in every direction, so that it can be scaled."""
+    """Return a pseudo-inertia (4, 4) with some extent in every direction, so that it can be scaled.
+
+    Principal second moments about the centre of mass become at least 1e-4 of their sum.
+    """
     central = pseudo[:3, :3] - np.outer(pseudo[:3, 3], pseudo[:3, 3]) / pseudo[3, 3]
     least = _MIN_SECOND_MOMENT_RATIO * max(float(np.trace(central)), 1e-12)
     values, axes = np.linalg.eigh(central)
@@ -160,6 +168,9 @@ def _add_min_extent(pseudo: np.ndarray) -> np.ndarray:
 
 
 def _parameter_scales(found: Identification, others: np.ndarray) -> np.ndarray:
-    """Return typical magnitudes (o,) of the parameters at indices `others` (o,), which are not of a body."""
+    """Return typical magnitudes (o,) of the parameters at indices `others` (o,), which are not of a body.
+
+    Each is the largest of given value, identified value (magnitudes), standard deviation and 1e-9.
+    """
     spread = {k: s for k, s in zip(found.data_identifiability.base, found.estimate.std, strict=True)}
     return np.array([max(abs(found.nominal[k]), abs(found.value[k]), spread.get(k, 0.0), 1e-9) for k in others])

@@ -104,9 +104,10 @@ def build_equations(
         setup: definition of the regressor.
         processing: method to differentiate the positions.
         position_resolution: noise and bandwidth of the positions.
-        with_noise: whether to compute `Equations.motion_noise`, and to keep more equations.
-        rate_errors: errors of the speeds of the sensed joints, if the record has other joints; by
-            default those of the joints of the record.
+        with_noise: whether to compute `Equations.motion_noise`, and to keep about four times as many
+            equations per second.
+        rate_errors: standard deviations of the speeds of the sensed joints, for a record that was
+            converted to other joints. By default they are those of the record's joints.
 
     Returns:
         The equations, and a regressor without rows that has names, units and nominal values.
@@ -187,7 +188,8 @@ def _compute_regressor_error_moments(
     """Return second moments (k, m, m) of regressor errors of k drives caused by motion errors.
 
     With parameters p, p' M_k p is the mean squared force error of drive k. The regressor of the filtered
-    motion is compared with those of random motions that the measured positions allow.
+    motion `motions` is compared with those of random motions that the measured positions allow: the
+    optimally smoothed motion minus samples of its error.
     """
     rows = slice(0, max(_MAX_NOISE_ROWS, 4 * len(low)))
     smoothed = smooth_and_differentiate(record.position[rows], record.period, position_resolution.noise)
@@ -310,6 +312,9 @@ def apply_low_pass(values: np.ndarray, filter_weights: np.ndarray, downsampling:
 def low_pass_forces(force: np.ndarray, period: float, filter_weights: np.ndarray, downsampling: int) -> np.ndarray:
     """Apply a low-pass filter to forces; interpolate short gaps and set long ones to NaN.
 
+    Forces are interpolated where unknown. A filtered force is NaN if more than 10 % of the filter's
+    weight is on rows that are more than 0.05 s from a known force.
+
     Args:
         force: (n, k) forces, NaN where unknown.
         period: time between rows [s].
@@ -352,7 +357,7 @@ class StackedEquations:
     """Stacked equations of several runs: n rows, k drives with known forces, m parameters.
 
     Attributes:
-        runs: the runs that are long enough, with the resolution of their positions.
+        runs: the used runs, with the resolution of their positions; short ones are left out.
         table: regressor without rows: names, units and nominal values; all drives.
         drive_columns: indices of the k drives in the table.
         used_rows: mask of the n used rows among the stacked equations of all runs.
@@ -431,9 +436,9 @@ class StackedEquations:
 
 
 def shift_by_rows(values: np.ndarray, step: int) -> np.ndarray:
-    """Replace each row of values (n, ...) by that `step` rows later, or earlier where there is none.
+    """Replace each row of values (n, ...) by the row `step` rows later, near the end by that `step` rows earlier.
 
-    Rows without either are NaN.
+    An earlier row is also used where the later one is NaN. Without either, the row is NaN.
     """
     later, earlier = np.full((2, *values.shape), np.nan)
     later[:-step], earlier[step:] = values[step:], values[:-step]
@@ -447,6 +452,9 @@ def stack_equations(
 ) -> StackedEquations:
     """Build the force equations of all runs and stack those in which all drive forces are known.
 
+    Drives without a known force in any run are left out, as are runs shorter than four periods of
+    the band.
+
     Args:
         runs: records and the resolution of their positions.
         setup: definition of the regressor.
@@ -456,7 +464,8 @@ def stack_equations(
         The stacked equations.
 
     Raises:
-        InputError: no drive has a known force, or all runs are too short.
+        InputError: no drive has a known force, all runs are too short, or no row has the forces of
+            all drives.
     """
     band = processing.band
     assert band

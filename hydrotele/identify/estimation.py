@@ -99,7 +99,9 @@ class WeightedEquations:
         self, identifiability: Identifiability, ridge: float = 0.0, truncation: float = 0.0,
         order: int | None = None,
     ) -> Estimate:  # fmt: skip
-        """Estimate the base parameters; undetermined combinations keep their given values.
+        """Estimate the base parameters by least squares, or with the instruments if there are any.
+
+        Parameters outside the base keep their given (nominal) values.
 
         Args:
             identifiability: the base parameters, as combinations of all parameters.
@@ -125,7 +127,10 @@ def weight_equations(
 ) -> WeightedEquations:
     """Weight the force equations as an estimation method requires.
 
-    Equations with an uncertain sign of dry friction get less weight, except for `least_squares`.
+    Equations with an uncertain sign of dry friction get less weight, except for `least_squares`. For
+    `gauss_markov` the covariance between the drives follows from the residuals of a first fit, or with
+    a period from their differences between successive periods. For `instruments` the regressor of
+    another period is added.
 
     Args:
         data: equations.
@@ -170,7 +175,8 @@ def find_identifiable_parameters(
 ) -> Identifiability:  # fmt: skip
     """Select the base parameters that noisy data determine.
 
-    Friction of drives at rest is excluded, because they do not slide.
+    They have standard deviations of at most half the reference size of the parameter. Friction of
+    drives at rest is excluded, because they do not slide.
 
     Args:
         data: weighted equations.
@@ -209,10 +215,12 @@ def find_identifiable_parameters(
 def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
     """Compute weights of force equations that decrease with the uncertainty of the friction sign.
 
+    A weight is `sqrt(v / (v + v_sign u^2))` with both variances and the uncertainty u.
+
     Args:
         error_variances: (k, 2) error variance of each drive, and the variance added by an uncertain
             friction sign.
-        sign_uncertainty: (n, k) uncertainty of the signs.
+        sign_uncertainty: (n, k) uncertainty of the signs of dry friction, 0 (certain) to 1 (unknown).
 
     Returns:
         (n, k) weights, at most 1.
@@ -223,12 +231,15 @@ def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -
 def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
     """Estimate each drive's error variance, and the variance added by an uncertain friction sign.
 
+    The squared residual is modelled as `v + v_sign u^2` with the uncertainty u.
+
     Args:
         residual: (n, k) residuals of a first estimate.
-        sign_uncertainty: (n, k) uncertainty of the signs of dry friction.
+        sign_uncertainty: (n, k) uncertainty of the signs of dry friction, 0 (certain) to 1 (unknown).
 
     Returns:
-        (k, 2) both variances of each drive, by non-negative least squares on squared residuals.
+        (k, 2) both variances of each drive, by non-negative least squares on squared residuals;
+        1 and 0 if the first one would be 0.
     """
     out = np.tile([1.0, 0.0], (sign_uncertainty.shape[1], 1))
     for k in range(sign_uncertainty.shape[1]):
@@ -243,7 +254,8 @@ def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray)
 def _long_run_std(residual: np.ndarray) -> np.ndarray:
     """Return the standard deviations (k,) of white noise that is as strong at low frequencies as residuals (n, k).
 
-    They are at least those of the residuals.
+    They follow from an autoregressive model of the residuals and are at least the residuals' own
+    standard deviations.
     """
     follow = fit_autoregression(residual)
     fresh = residual.copy()
@@ -259,7 +271,7 @@ _REDUCTION_CONTEXT = "reduction"
 
 @dataclass(frozen=True)
 class ReductionStep:
-    """One step of a reduction.
+    """One step of the simplification of a model by `reduce_parameters`.
 
     Attributes:
         action: `start`, `drop` or `merge`.
@@ -282,11 +294,12 @@ class ReductionStep:
 
 @dataclass(frozen=True)
 class Reduction:
-    """Result of a reduction.
+    """Result of the simplification of a model by `reduce_parameters`.
 
     Attributes:
         steps: the steps; the first is the full model.
-        groups: names that share a parameter, for every remaining parameter.
+        groups: for each of the p remaining parameters, the names of the original parameters that it
+            represents.
         value: (p,) estimates of the remaining parameters.
         std: (p,) standard deviations.
     """
@@ -303,11 +316,12 @@ def reduce_parameters(
 ) -> Reduction:  # fmt: skip
     """Simplify a model: drop insignificant candidate parameters and merge those that do not differ.
 
-    The least significant candidate is dropped first, until all remaining ones are significant. The
-    threshold is a normal deviate. If no candidate has an effect, at least one exceeds it with a
-    probability of 5 %. Within a group, the two candidates with the most correlated estimates get a
-    common parameter, unless the residuals show by the same threshold that they differ. Candidates
-    that are not significant after merging are dropped as well.
+    The least significant candidate is dropped first, until all remaining ones are significant. A
+    candidate is significant if its estimate over its standard deviation reaches a threshold. If no
+    candidate has an effect, at least one reaches it with a probability of 5 %. Within a group, the
+    two candidates with the most correlated estimates get a common parameter, unless this increases
+    the weighted squared residuals by more than the squared threshold. Candidates that are not
+    significant after merging are dropped as well.
 
     Args:
         matrix: (n, k, p) regressor of independent parameters.

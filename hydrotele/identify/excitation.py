@@ -118,6 +118,9 @@ def compute_information(
             covariance.
         base: indices of the p base parameters.
         sizes: (p,) units in which the parameters are expressed; 1 by default.
+
+    Returns:
+        (p, p) information, the sum over all rows and drives divided by the number of rows.
     """
     found = setup.project_motion_on_drives(*motions)
     table = setup.compute_regressor(found)
@@ -136,6 +139,9 @@ def select_determinable_parameters(
     machine: Machine, setup: RegressorSetup, noise: np.ndarray, period: float = 20.0, seed: int = 0
 ) -> np.ndarray:
     """Select the base parameters that a random motion of the machine determines despite force noise.
+
+    Their standard deviation, with force readings every 0.02 s over one period, is at most half of
+    their reference size.
 
     Args:
         machine: the machine.
@@ -181,14 +187,14 @@ class MotionLimits(Protocol):
     half_range: np.ndarray
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-        """Compute how far each limit is used at each row of a motion, 1 at the limit.
+        """Compute how far each of l limits is used at each row of a motion, 1 at the limit.
 
         Args:
             motions: (3, n, k) positions, rates and accelerations.
             clipped: the same with positions clipped to `lower` and `upper`.
 
         Returns:
-            (n, l) utilisation, 1 at the limit.
+            (n, l) utilisation, above 1 where a limit is exceeded.
         """
         ...
 
@@ -201,7 +207,7 @@ def design_motion(
 ) -> Excitation:  # fmt: skip
     """Design a D-optimal Fourier motion of the given joints within limits.
 
-    Maximises ln det of the information about the base parameters.
+    It maximises ln det of the Fisher information about the base parameters, divided by their number.
 
     Args:
         limits: limits of the motion; `MachineLimits` evaluates those of a machine.
@@ -275,9 +281,10 @@ def design_motion(
 
 
 def _scale_into_limits(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
-    """Reduce the parameters of a motion by the factor `step`, up to 60 times, until it is within all limits.
+    """Multiply the parameters of a motion by `step` < 1, up to 60 times, until it is within all limits.
 
-    `measure` returns (criterion, utilisation of the limits) of a motion.
+    `measure` returns (criterion, utilisation of the limits) of a motion. The last parameters are
+    returned, even if they exceed a limit.
     """
     for _ in range(60):
         if measure(x)[1].max() <= 1.0:
@@ -383,7 +390,11 @@ class MachineLimits:
         self.drives = [setup.chain.index(d) for d in setup.chain.drives]
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-        """Return the utilisation (n, l) of joint ranges, drives and pump flow at each row, 1 at the limit."""
+        """Return the utilisation (n, l) of joint ranges, drives and pump flow at each row, 1 at the limit.
+
+        Limits are reduced by margins: 5 % of ranges and strokes, 80 % of the force at relief pressure
+        and of the valve's rated flow, and 95 % of the pump flow. Args as in `MotionLimits`.
+        """
         parts = [
             1.0 + (motions[0] - self.upper) / self.half_range,
             1.0 + (self.lower - motions[0]) / self.half_range,
@@ -402,9 +413,9 @@ class MachineLimits:
     def _drive_utilisation(
         self, axis: str, i: int, projection: Projection, force: np.ndarray, flow: np.ndarray
     ) -> np.ndarray:
-        """Return how far a drive's force, valve flow and stroke limits are used at each row (n,).
+        """Return the largest utilisation (n,) of a drive's force, valve flow and stroke limits at each row.
 
-        The drive's flow is added to `flow` (n,) [m^3/s] in place.
+        It is 1 at the limit. The drive's flow is added to `flow` (n,) [m^3/s] in place.
         """
         facts, supply = self.machine.axes[axis], self.machine.supply
         j = self.drives[i]

@@ -78,7 +78,7 @@ def compute_drive_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSe
 def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
     """Set the speed below which each drive counts as at rest, 0.2 % of its RMS speed.
 
-    At rest the dry friction of a drive is unknown.
+    At rest the dry friction of a drive is unknown. Drives without a speed are unchanged.
 
     Args:
         setup: definition of the regressor.
@@ -96,6 +96,9 @@ def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]
 
 def add_low_speed_friction_deviations(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
     """Add parameters for deviations of the drives' friction from its law near zero speed.
+
+    Every moving drive with Coulomb friction gets deviations of four widths, 1/32 to 1/4 of its RMS
+    speed.
 
     Args:
         setup: definition of the regressor.
@@ -120,7 +123,9 @@ def compute_friction_forces(
 ) -> tuple[FrictionForce, ...]:  # fmt: skip
     """Compute the identified friction force of each drive at round speeds, with 95 % intervals.
 
-    The speeds are those of 1, 3, 10, ... within the range of the fitted runs.
+    The speeds are 1 or 3 times a power of ten (rad/s or m/s), from 1/32 of the RMS speed to the
+    maximum speed of the drive in the fitted runs. The force is half the difference of the forces in
+    both directions.
 
     Args:
         setup: definition of the regressor.

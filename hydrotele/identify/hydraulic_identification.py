@@ -49,7 +49,8 @@ class HydraulicParameter:
         value: identified value.
         std: standard deviation.
         ci95: 95 % interval.
-        is_determined: whether the data determine it; otherwise value and std are mostly those of the prior.
+        is_determined: whether the data determine it, with a standard deviation below 0.7 of that of the
+            prior; otherwise value and std are mostly those of the prior.
     """
 
     effect: str
@@ -74,7 +75,7 @@ class HydraulicIdentification:
 
     Attributes:
         parameters: the identified parameters.
-        machine: machine with the parameters that the data determine.
+        machine: the given machine with the identified values of the parameters that the data determine.
         nominal_rms_error: RMS of the one-step prediction errors of the held-out run with the given machine,
             each divided by its predicted standard deviation [1]. The noise is that stated by the sensors,
             otherwise that found with the identified machine.
@@ -95,6 +96,9 @@ def identify_hydraulics(
     dataset: Dataset, jobs: int = 2, progress: Callable[[str, float], None] | None = None
 ) -> HydraulicIdentification:
     """Identify the parameters of valves, oil, leakage, pump and relief valve.
+
+    All are fitted together to the one-step prediction errors of a Kalman filter and to priors, the
+    given values with the standard deviations of the effects.
 
     Args:
         dataset: logs of the machine; the search starts from its machine.
@@ -144,7 +148,8 @@ def _fit_in_rounds(evidence: Evidence, guess: Guess, report: Callable[[str, floa
     """Fit the parameters by Gauss-Newton steps in rounds, each with new Kalman filter gains.
 
     Returns:
-        (the fit, whether the last round changed each parameter by less than 0.2 standard deviations).
+        (the fit, whether the last of at most six rounds changed each parameter by less than 0.2
+        standard deviations).
     """
     fit = None
     for k in range(_MAX_ROUNDS):
@@ -188,7 +193,11 @@ def _apply_parameters(machine: Machine, numbers: tuple[HydraulicParameter, ...])
 
 
 def _prediction_error_rms(machine: Machine, data: Dataset, levels: Levels) -> float:
-    """Return the RMS of a machine's one-step prediction errors of the held-out run, over their noise [1]."""
+    """Return the RMS of a machine's one-step prediction errors of the held-out run [1].
+
+    Each error is divided by the standard deviation that the filter predicts for it with the noise
+    `levels`.
+    """
     data = dataclasses.replace(data, machine=machine)
     whitened = track_run(machine, data, data.heldout, levels=levels).whitened
     return float(np.sqrt(np.nanmean(whitened**2)))

@@ -57,7 +57,10 @@ class Identifiability:
         return {s: self.status.count(s) for s in known}
 
     def format_combination(self, base: int) -> str:
-        """Return a base parameter as text, such as `inertia_zz.swing + 2.5 mass.boom`."""
+        """Return a base parameter, with its row number in `combination`, as text.
+
+        An example is `inertia_zz.swing + 2.5 mass.boom`.
+        """
         row = self.combination[base]
         parts = []
         for k in [self.base[base], *np.flatnonzero(row)]:
@@ -114,11 +117,11 @@ def classify_noisy_parameters(
 ) -> Identifiability:
     """Classify parameters by the accuracy with which noisy equations determine them.
 
-    A base parameter has a standard deviation of at most half its reference size. A column is
-    selected if its component orthogonal to the selected ones exceeds the noise. Then the least
-    accurate ones are removed one by one, which improves the others. Each remaining column is,
-    within the noise, a combination of the selected ones. It is named in a base parameter that it
-    would shift by at least a tenth of a standard deviation.
+    A base parameter has a standard deviation of at most half its reference size. A column of the
+    matrix is selected if its component orthogonal to the selected columns exceeds the noise. Then the
+    least accurate selected columns are removed one by one, which improves the others, until all are
+    accurate enough. Each other column is, within the noise, a combination of the selected ones. It
+    is named in a base parameter that it would shift by at least a tenth of a standard deviation.
 
     Args:
         matrix: (N, m) equations divided by the standard deviation of their errors.
@@ -152,9 +155,11 @@ def classify_noisy_parameters(
 
 
 def _select_columns_above_noise(scaled: np.ndarray, length: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Select candidate columns so that the parameters of the selected ones have standard deviations <= 1.
+    """Return the indices of selected candidate columns, whose parameters have standard deviations <= 1.
 
-    Columns are scaled such that 1 is the accuracy required; `length` are their norms (m,).
+    Columns are scaled such that 1 is the accuracy required; `length` are their norms (m,). Columns are
+    selected in order if their component orthogonal to the selected ones exceeds 1. Then the least
+    accurate ones are removed one by one.
     """
     chosen: list[int] = []
     span = np.zeros((len(scaled), 0))
@@ -214,9 +219,10 @@ def reference_sizes(
 ) -> np.ndarray:
     """Return a typical magnitude of each parameter, with which its standard deviation is compared.
 
-    Sizes of a body follow from its given mass and radius of gyration. Sizes of friction are the
-    given values, at least a fraction of the drive force. Deviations of friction near zero speed have
-    the size of the drive force, so that they are left out only if nothing is known of them.
+    Sizes of a body follow from its given mass and radius of gyration. Sizes of friction and offsets are
+    the given values, at least 5 % of the drive force; for viscous friction that is the force at 0.1 m/s
+    or rad/s. Deviations of friction near zero speed have the size of the drive force, so that they are
+    left out only if nothing is known of them.
 
     Args:
         table: the parameters.

@@ -78,7 +78,7 @@ def propagate_noise(
     record: IdentificationRecord, position_resolution: Resolution, gain: np.ndarray, setup: RegressorSetup,
     processing: Processing, value: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the covariance of an estimate that the sensor noise of one run causes.
+    """Compute the covariance of an estimate that the noise of one run's forces and positions causes.
 
     Args:
         record: the run.
@@ -87,10 +87,10 @@ def propagate_noise(
             drive; 0 if not used.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
-        value: (m,) parameters.
+        value: (m,) parameters, for the sensitivities of the forces to the motion.
 
     Returns:
-        (p, p) covariance.
+        (p, p) covariance; unknown force noise counts as 0.
 
     Source: first-order propagation of errors; Abdellatif 2008, section 4.2 (noise of positions).
     """
@@ -123,7 +123,8 @@ def propagate_noise(
 def _compute_sensitivities(motion: SmoothedSignal, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
     """Return derivatives (3, n, k, j) of k drive forces by positions, rates and accelerations of j joints.
 
-    In long runs they are computed at every few rows and interpolated, since they change slowly.
+    They are forward differences with steps of one standard deviation, for the first `count` = n rows. In
+    long runs they are computed at every few rows and interpolated, since they change slowly.
     """
     rows = np.arange(0, count, max(1, count // _MAX_SENSITIVITY_ROWS))
     motions = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
@@ -214,7 +215,8 @@ def _simulate_record(
 ) -> IdentificationRecord:
     """Return a record with smoothed positions and the forces that the parameters predict for them.
 
-    Forces that were unknown stay unknown.
+    Positions are optimally smoothed, or those of the mean cycle for the method `periodic`. Forces that
+    were unknown stay unknown (NaN).
     """
     if processing.method == "periodic":
         motion = compute_joint_motion(record.position, record.period, position_resolution, processing)
@@ -230,8 +232,9 @@ def _iterate_segments(
 ) -> Iterator[tuple[IdentificationRecord, Resolution, np.ndarray]]:
     """Yield parts of the runs for the simulation of noise, with the resolution and noise (k,) of positions.
 
-    The parts limit the computing time for long runs. If a periodic motion is reduced to its mean cycle,
-    fewer cycles are averaged in a part; the noise is then reduced to that of the mean of all cycles.
+    The parts, about 240 s in total, limit the computing time for long runs. If a periodic motion is
+    reduced to its mean cycle, fewer cycles are averaged in a part; the noise is then reduced to that of
+    the mean of all cycles.
     """
     lengths = [len(record.force) * record.period for record, _ in data.runs]
     part = min(1.0, _MAX_BIAS_DURATION_S / sum(lengths))
@@ -466,15 +469,17 @@ def identify_with_friction_shapes(
 ) -> Identification:  # fmt: skip
     """Identify a mechanism's parameters with the form of dry friction that fits best, without wild readings.
 
-    Dry friction is as smooth as the machine states, or changes its sign sharply: the smoothing velocity of a machine
-    often serves only the simulation. Deviations near zero speed are added if they improve Schwarz's criterion. They
-    need a wider band than the motion, which is also the band of the result.
+    Wild readings are single samples far outside their neighbours; they are removed first. Schwarz's
+    criterion (BIC) selects the form of dry friction. Its sign change is smooth as the machine states, or
+    sharp, because the smoothing velocity of a machine often serves only the simulation. Deviations from
+    the friction law near zero speed are added if they improve the criterion. These are compared in a
+    wider frequency band, which the result also uses if they are added.
 
     Args:
         fit: records to fit.
         heldout: record for validation.
         setup: definition of the regressor.
-        processing: method to differentiate the positions, and the band.
+        processing: method to differentiate the positions, and the band; a stated band is not widened.
         estimator: options of the estimator.
         notes: notes to include in the result.
 
@@ -514,7 +519,8 @@ def identify_with_friction_shapes(
 def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> Processing:
     """Return the processing options with a band wide enough for the sign changes of dry friction.
 
-    Options with a stated band, or with the periodic method, are returned unchanged.
+    It is the smallest `Resolution.friction_band` of the runs. Options with a stated band, or with the
+    periodic method, are returned unchanged.
     """
     if processing.band or processing.method == "periodic":
         return processing
@@ -523,7 +529,10 @@ def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> 
 
 
 def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
-    """Return the first runs up to a total length of about 600 s; a run longer than that is cut."""
+    """Return the first runs up to a total length of about 600 s; a run longer than that is cut.
+
+    With the period [s] of a repeated motion, it is cut to whole periods.
+    """
     some, seconds = [], 0.0
     for record in fit:
         some.append(keep_beginning(record, _SHAPE_SELECTION_DURATION_S, period))

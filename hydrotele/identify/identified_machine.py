@@ -22,7 +22,9 @@ def build_identified_machine(
     """Return a machine with identified masses, inertias, friction and force offsets.
 
     Links of a `Machine` have principal axes parallel to their frames, and tubes and rods have their
-    centre of mass on their axis. The result is the machine of this form with the best fit.
+    centre of mass on their axis. The result is the machine of this form with the best fit. A force
+    offset is written only if it changes by at least two standard deviations. For a hydraulic axis it is
+    written as a sensor error of the head pressure.
 
     Args:
         machine: the given machine.
@@ -55,7 +57,10 @@ def build_identified_machine(
 
 
 def _bar_axis(found: Identification, body: str) -> np.ndarray:
-    """Return the direction of a bar's centre of mass in its frame, a unit vector (3,)."""
+    """Return the direction of a tube's or rod's given centre of mass in its frame, a unit vector (3,).
+
+    It is the x axis if the first moment is 0.
+    """
     places = [found.names.index(f"moment_{c}.{body}") for c in "xyz"]
     moment = found.nominal[places]
     size = np.linalg.norm(moment)

@@ -18,7 +18,7 @@ def build_identify_document(
     Args:
         found: identification of the mechanism, None if no force is known.
         hydraulics: identification of the hydraulics, None if not requested.
-        best: the nearest physically consistent parameters.
+        best: the physically consistent parameters nearest to the identification, or None.
 
     Returns:
         Keys `parameters`, `condition`, `heldout`, `friction`, `counts`, `status`, `seconds`, `band_hz`,

@@ -206,7 +206,10 @@ def estimate_resolution(positions: np.ndarray, period: float, noise: np.ndarray,
 def compute_joint_motion(
     positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
 ) -> SmoothedSignal:
-    """Filter and differentiate the positions of all joints.
+    """Filter and differentiate the positions of all joints by the method in `processing`.
+
+    Joints at rest are smoothed optimally by every method, because a filter would turn their noise into
+    motion.
 
     Args:
         positions: (n, k) positions [rad] or [m], NaN where missing.
@@ -258,7 +261,7 @@ def _apply_linear_filter(
     positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing,
     noise: np.ndarray | None,
 ) -> SmoothedSignal:  # fmt: skip
-    """Filter and differentiate columns by a method that is linear in the readings.
+    """Filter and differentiate positions (n, k) by a method that is linear in the readings.
 
     `zero_phase` filters forwards and backwards, `periodic` keeps the mean and first harmonics of the mean
     cycle, and `raw` takes differences without a filter.

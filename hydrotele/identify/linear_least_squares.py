@@ -152,7 +152,13 @@ class _SolverOptions(NamedTuple):
 
 
 class _SolutionProperties(NamedTuple):
-    """Condition number, inverse of the normal equations and rank of scaled equations."""
+    """Properties of a least-squares solution.
+
+    Attributes:
+        condition: condition number of the scaled equations.
+        inverse_normal_matrix: (p, p) inverse of the matrix of the normal equations.
+        rank: number of singular values that were not truncated.
+    """
 
     condition: float
     inverse_normal_matrix: np.ndarray
@@ -162,9 +168,10 @@ class _SolutionProperties(NamedTuple):
 def _solve_with_drive_weights(
     x, y, z, shape: _SolverOptions
 ) -> tuple[np.ndarray, np.ndarray, _SolutionProperties, np.ndarray]:
-    """Solve y = x @ parameters by least squares, or with instruments z if given.
+    """Solve y (n, k) = x (n, k, p) @ parameters by least squares, or with instruments z (n, k, p) if given.
 
-    If requested, the drives are weighted by their residuals and the equations solved again.
+    If `shape.weight_by_residuals`, the equations of each drive are divided by its RMS residual and
+    solved again.
 
     Returns:
         Four items: estimates (p,); their derivative by the forces (p, n, k); solution properties; the RMS

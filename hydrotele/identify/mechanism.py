@@ -188,8 +188,9 @@ def load_mechanism_records(
     Args:
         paths: log files (.csv, .parquet), folders of them, run folders.
         mechanism: the mechanism.
-        heldout: name of the held-out run. By default it is the first one that begins with `test`,
-            otherwise the last. A single run is split in time.
+        heldout: name of the held-out run. By default it is the first one, in order of names, that
+            begins with `test`, otherwise the last. A single run is split in time: its first two
+            thirds are fitted, the remainder is held out.
         period: period of a repeated motion [s]; a single run is then split at a whole period.
         keep_measured_joints: whether to keep positions of the measured joints, instead of converting
             them to the joints in which the mechanism's motion is described.
@@ -230,7 +231,12 @@ def load_mechanism_records(
 
 
 class _Column(NamedTuple):
-    """Channel name and sign of a column."""
+    """Log column of a position or force.
+
+    Attributes:
+        channel: name of the channel in the log.
+        sign: factor of its readings, +1 or -1.
+    """
 
     channel: str
     sign: float
@@ -347,8 +353,8 @@ def convert_to_given_joints(record: IdentificationRecord, setup: RegressorSetup)
         setup: definition of the regressor with the given joints.
 
     Returns:
-        The record, unchanged if the joints are the same, otherwise computed by forward kinematics
-        row by row.
+        The record, unchanged if the joints are the same. Otherwise positions are computed by forward
+        kinematics row by row, and their noise is unknown (NaN).
 
     Raises:
         InputError: a position is missing in a row, or cannot be reached.

@@ -62,7 +62,7 @@ def transition_matrices(order):
 
 @compiled
 def _marginalise_input(info, drive, ratio, order, column):
-    """Reduce a state's information matrix R, in place, by the uncertainty of the random input of one step.
+    """Reduce a state's information matrix R (`info`), in place, by the uncertainty of the input of one step.
 
     R becomes R - R b (1/r + b'R b)^-1 b'R, where b (`drive`) is the effect of the input on the state and r
     (`ratio`) its variance. The gain (1/r + b'R b)^-1 R b is written to `column`; 1/r + b'R b is returned.
@@ -438,7 +438,11 @@ def _simulate_chain(inputs, order):
 
 @compiled
 def _evaluate_objective(samples, known, exponent, order, use_likelihood, noise_known, work):
-    """Return the objective for the variance ratio 10^exponent: minus log likelihood, or cross-validation."""
+    """Return the objective to be minimised for the variance ratio 10^exponent (input over noise).
+
+    It is minus twice the log likelihood, apart from a constant, or else the logarithm of the generalised
+    cross-validation score. `work` holds work arrays.
+    """
     infos, gains, totals, states, variances = work
     ratio = 10.0**exponent
     residuals, inputs, logs = smooth_states(samples, known, ratio, order, infos, gains, totals, states)
@@ -481,7 +485,7 @@ def _find_best_exponent(samples, known, order, use_likelihood, noise_known, work
 
 @compiled
 def _smooth_column(samples, known, ratio, order, use_likelihood, noise_known):
-    """Smooth one dimensionless column; a ratio of NaN is estimated.
+    """Smooth one dimensionless column; a variance ratio (input over noise) of NaN is estimated.
 
     Returns:
         (states (n, m), variances (n, m), ratio, noise standard deviation over the given unit).

@@ -150,13 +150,16 @@ def cut_to_whole_cycles(record: IdentificationRecord, period: float) -> Identifi
 def check_periodicity(record: IdentificationRecord, period: float, noise: np.ndarray) -> None:
     """Raise InputError if the motion of a record does not repeat.
 
+    The criterion for each axis is the median difference of positions one period apart. It must not
+    exceed eight times that of the noise.
+
     Args:
         record: the record.
         period: stated period of the motion [s].
         noise: (k,) noise of the positions [rad] or [m].
 
     Raises:
-        InputError: positions differ from those one period before by much more than the noise.
+        InputError: the motion of an axis does not repeat after the period.
     """
     step = round(period / record.period)
     if step < 1 or len(record.force) <= step:
@@ -276,7 +279,7 @@ def _compute_joint_position(machine: Machine, axis: str, linkage: DriveLinkage, 
 
 
 def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
-    """Return the pressure channels that give a drive's force.
+    """Return the names of the two pressure channels that give a hydraulic drive's force.
 
     The result is empty for a force drive, and None if a channel is missing.
     """
@@ -287,7 +290,11 @@ def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
 
 
 def _compute_force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
-    """Compute the drive force (n,) of an axis from pressures or command, and its noise [N] or [N m]."""
+    """Compute the drive force (n,) of an axis from pressures or command, and its noise [N] or [N m].
+
+    The noise is a standard deviation: 0 for a force from a command. Both are NaN if a pressure channel
+    is missing.
+    """
     machine = dataset.machine
     channels = _force_channels(dataset, axis)
     facts = machine.axes[axis]
@@ -313,6 +320,8 @@ def _read_corrected_channel(dataset: Dataset, run: RunData, channel: str) -> tup
 
 def correct_sensor_error(values: np.ndarray, error: SensorError, period: float, start: float = 0.0) -> np.ndarray:
     """Remove a known sensor error (offset, drift, scale, delay, lag) from readings.
+
+    Offset and drift are subtracted, the result is divided by the scale and moved earlier by the delay.
 
     Args:
         values: (n,) readings, NaN where missing.

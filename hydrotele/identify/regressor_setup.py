@@ -116,7 +116,8 @@ class RegressorSetup:
             rate_std: (n, v) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
         Returns:
-            The regressor, with one column per group of equal parameters and none for absent ones.
+            The regressor, with one column per group of equal parameters and none for the parameters
+            in `zero_parameters`.
 
         Raises:
             InputError: a body, joint or parameter is unknown.
@@ -134,7 +135,20 @@ class RegressorSetup:
 
 
 def _merge_columns(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
-    """Return a regressor with summed columns for equal parameters and without absent ones."""
+    """Return a regressor with summed columns for equal parameters, without those of parameters known to be 0.
+
+    Args:
+        whole: regressor with one column per parameter.
+        alike: groups of bodies, joints or closures with the same parameters. The sum has the name of
+            the group's first member, and its nominal value is the mean of the group.
+        absent: names of the parameters known to be 0.
+
+    Returns:
+        The regressor with fewer columns.
+
+    Raises:
+        InputError: a group member has no parameters, or a name in `absent` is not a parameter.
+    """
     first = {place: group[0] for group in alike for place in group}
     names, members = [], {}
     for k, name in enumerate(whole.names):

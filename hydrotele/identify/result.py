@@ -19,7 +19,9 @@ from hydrotele.multibody.regressor import is_friction_deviation
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """Prediction error of one drive's force on the held-out run, in the band of the equations.
+    """Prediction error of one drive's force on the held-out run.
+
+    Both forces are low-pass filtered to the frequency band of the identification equations.
 
     Attributes:
         rms: RMS of measured minus predicted force [N] or [N m].
@@ -47,7 +49,7 @@ class HeldOutError:
 
 @dataclass(frozen=True)
 class HeldOutForces:
-    """Forces of the held-out run in the band of the equations: n rows, k drives [N] or [N m].
+    """Forces of the held-out run, low-pass filtered: n rows, k drives [N] or [N m].
 
     Attributes:
         run: name of the run.
@@ -108,7 +110,10 @@ class Identification:
 
     @property
     def explains_force(self) -> bool:
-        """Whether the identified model predicts the held-out force of any drive better than zero force does."""
+        """Whether the identified model predicts the held-out force of any drive better than zero force does.
+
+        True also if no held-out force is known.
+        """
         return not self.heldout or any(h.is_explained for h in self.heldout.values())
 
     def squared_distance(self, value: np.ndarray) -> tuple[float, float]:

@@ -69,7 +69,8 @@ def _rms(values: np.ndarray) -> float:
 def _is_better_than_zero(force: np.ndarray, error: np.ndarray, equations: Equations) -> bool:
     """Return whether prediction errors are significantly smaller than those of predicting zero force.
 
-    A band b [Hz] over a duration T holds 2 b T independent values.
+    The mean of force^2 - error^2 must exceed two standard deviations of this mean. A band b [Hz] over a
+    duration T holds 2 b T independent values.
     """
     gain = force**2 - error**2
     independent = max(2.0 * equations.band * len(force) * equations.spacing, 2.0)
@@ -79,12 +80,13 @@ def _is_better_than_zero(force: np.ndarray, error: np.ndarray, equations: Equati
 def compute_heldout_forces(equations: Equations, table: Regressor, value: np.ndarray) -> HeldOutForces:
     """Compute the forces of the held-out run predicted with identified and given parameters.
 
-    They are returned with the measured forces.
-
     Args:
         equations: equations of the held-out run.
         table: names, units and nominal values of the m parameters.
         value: (m,) identified parameters.
+
+    Returns:
+        Measured and predicted forces of all drives.
     """
     return HeldOutForces(
         equations.name, table.drives, equations.time, equations.force, equations.matrix @ value,
@@ -100,8 +102,8 @@ def find_wrong_force_columns(forces: HeldOutForces, heldout: dict[str, HeldOutEr
         heldout: prediction errors of the held-out run.
 
     Returns:
-        One note per drive whose measured force is a negative, very large or very small multiple of that of the
-        given model.
+        One note per drive whose measured force is a negative, large or small multiple of that of the given
+        model: the ratio is outside 1/8 to 8, and the correlation at least 0.8 in magnitude.
     """
     notes = []
     for k, drive in enumerate(forces.drives):
@@ -153,7 +155,7 @@ def find_implausible_parameters(identifiability: Identifiability, table: Regress
 
 
 def describe_drives_at_rest(heldout: dict[str, HeldOutError], run: str) -> tuple[str, ...]:
-    """Return notes on drives that are at rest in the held-out run.
+    """Return notes on drives that are at rest in more than 5 % of the rows of the held-out run.
 
     Args:
         heldout: prediction errors of the held-out run.
@@ -182,6 +184,10 @@ def assess_identification(
     findings: tuple[str, ...] = (),
 ) -> str:
     """Assess an identification: return `ok`, or the most important problem with its remedy.
+
+    Problems are checked in this order: held-out forces predicted worse or not significantly better than
+    by zero force; joints at rest; no held-out force; relative error above 0.5; `findings`; error above
+    three times the fitted residuals (overfitted); error above 1.5 times the sensor noise.
 
     Args:
         heldout: prediction errors of the held-out run.

@@ -17,9 +17,10 @@ _STD_OVER_MAD = 1.4826  # standard deviation over median absolute deviation of n
 def find_wild_readings(values: np.ndarray) -> np.ndarray:
     """Find readings that lie far outside their neighbours.
 
-    A reading is wild if it lies outside the inner range of its six neighbours by more than the width of that range,
-    by more than the noise, and by more than half of the signal's range. Steps and smooth peaks are not wild. Up to
-    two wild readings in a row are found.
+    The inner range of a reading's six neighbours is that without their largest and smallest value. A reading is
+    wild if it lies outside by more than the width of this range, by more than eight standard deviations of the
+    noise, and by more than half of the central 90 % range of the signal. At the first and last three rows it must
+    be four times as far outside. Steps and smooth peaks are not wild. Up to two wild readings in a row are found.
 
     Args:
         values: (n,) readings, NaN where unknown.
@@ -58,7 +59,7 @@ def remove_wild_readings(
 ) -> tuple[IdentificationRecord, tuple[str, ...]]:
     """Remove single readings far outside their neighbours from a record's forces and positions.
 
-    Wild forces become unknown; wild positions are replaced by interpolation between their neighbours.
+    Wild forces become unknown (NaN); wild positions are replaced by interpolation between their neighbours.
 
     Args:
         record: the record.

@@ -225,10 +225,14 @@ def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
 def _plane_point_and_derivatives(
     geometry: ArmGeometry, q: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Compute the controlled point in the arm's vertical plane, and its derivatives.
+    """Compute the controlled point in the arm's vertical plane, and its derivatives by the joint angles.
 
     Returns:
-        ((x from the swing axis, z from the boom pin) [m], dx/dq, dz/dq by the angles q[1:], without swing).
+        ((x, z), dx/dq, dz/dq). x is the distance ahead of the swing axis and z the height above the
+        boom pin [m]. The derivatives are by the angles q[1:], without the swing [m/rad].
+
+    Raises:
+        ValueError: the number of angles is not that of the arm's joints.
     """
     if len(q) != 3 + geometry.has_tool_joint:
         raise ValueError(f"this arm has {3 + geometry.has_tool_joint} joints, got {len(q)} angles")
@@ -250,16 +254,18 @@ def _plane_point_and_derivatives(
 
 
 def outer_bar_end(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float, float, float]:
-    """Compute the end of the outer bar for a pose, relative to the boom pin in the arm plane.
+    """Compute where the outer bar of an arm must end for a pose, and the length of this bar.
 
-    The outer bar is the stick; without a tool joint it extends to the controlled point.
+    With a tool joint, the outer bar is the stick and ends at the tool pin. Without one, it is the
+    straight line from the stick pin to the controlled point.
 
     Args:
         geometry: the arm.
         pose: r [m], theta [rad], z [m] and, with a tool joint, phi [rad].
 
     Returns:
-        x ahead, z up [m], length of the outer bar [m], angle from the stick to that bar [rad].
+        (x, z, length, angle): x ahead of and z above the boom pin, in the arm plane, at which the
+        bar must end [m]; length of the bar [m]; angle from the stick to the bar [rad].
 
     Raises:
         UnreachableError: the radius is less than the lateral offset of the arm plane.

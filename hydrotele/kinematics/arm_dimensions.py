@@ -54,7 +54,11 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
 
 
 def is_planar_arm(machine: Machine) -> bool:
-    """Return whether swing rotates about z, and boom and stick about -y, as `kinematics.arm` requires."""
+    """Return whether a machine's swing joint has the axis z, and boom and stick joint -y, each in its link's frame.
+
+    `kinematics.arm` requires these axes. The machine must have an `arm`; its tool joint is not
+    checked.
+    """
     assert machine.arm
     wanted = ((0, 0, 1), (0, -1, 0), (0, -1, 0))
     joints = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
@@ -90,14 +94,15 @@ def tip_position(machine: Machine, joints: np.ndarray) -> np.ndarray:
 
 
 def solve_joints_for_tip(machine: Machine, tip: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Compute swing, boom and stick angle for a tip position, for any joint axes, by Newton's method.
+    """Compute the swing, boom and stick angle that bring the tip to a position, by Newton's method.
 
-    It takes at most 8 steps; convergence is not checked.
+    The joint axes may have any direction. The method takes at most 8 steps; convergence is not
+    checked.
 
     Args:
         machine: a machine with an `arm` of three joints.
-        tip: (3,) position of the tip [m].
-        start: (3,) swing, boom and stick near the solution [rad].
+        tip: (3,) position of the tip in the world [m].
+        start: (3,) swing, boom and stick angle near the solution [rad].
 
     Returns:
         (3,) angles [rad].
@@ -149,9 +154,11 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
 
 
 def _check_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
-    """Raise InputError if an arm's pins or axes do not fit the closed form for a feller-buncher's arm.
+    """Raise InputError if an arm does not have the form of `kinematics.feller_arm`.
 
-    `aside` are the pin coordinates that must be 0 [m].
+    Checked are the joint axes, that each joint carries the next, that the tip is on the head, and
+    that all coordinates in `aside` are 0 [m]. `joints` are the names of swing, boom, stick, tool
+    and head joint.
     """
     where = f"machine {machine.name}: arm"
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1))

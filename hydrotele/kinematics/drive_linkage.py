@@ -23,15 +23,15 @@ class DirectDrive:
     """A drive that acts on its joint directly: drive and joint coordinate are equal."""
 
     def length(self, theta: Any) -> Any:
-        """Return the drive coordinate, [rad] or [m], same shape as theta."""
+        """Return the drive coordinate, which equals the joint coordinate theta, [rad] or [m]."""
         return theta
 
     def rate(self, theta: Any) -> Any:
-        """Return d(drive)/d(joint) = 1, same shape as theta."""
+        """Return the derivative of the drive by the joint coordinate: 1, in the shape of theta."""
         return 0.0 * theta + 1.0
 
     def angle(self, length: Any) -> Any:
-        """Return the joint coordinate, [rad] or [m], same shape as length."""
+        """Return the joint coordinate, which equals the drive coordinate `length`, [rad] or [m]."""
         return length
 
 
@@ -40,8 +40,9 @@ class SliderLinkage:
     """A cylinder on a prismatic joint: length = sqrt((x + along)^2 + across^2).
 
     Attributes:
-        along: distance of the pins along the joint axis at joint position 0 [m].
-        across: distance of the pins perpendicular to the axis [m].
+        along: distance from base pin to rod pin along the joint axis at joint position 0, with sign
+            [m].
+        across: distance of the pins perpendicular to the joint axis [m].
     """
 
     along: float
@@ -52,11 +53,15 @@ class SliderLinkage:
         return np.hypot(theta + self.along, self.across)
 
     def rate(self, theta: Any) -> Any:
-        """Return d(length)/d(position) [-], any shape."""
+        """Return the derivative of the pin-to-pin length by the joint position theta [-], any shape."""
         return (theta + self.along) / self.length(theta)
 
     def angle(self, length: Any) -> Any:
-        """Return the joint position [m] at a length [m], on the extended side, any shape."""
+        """Return the joint position [m] at a pin-to-pin length [m], any shape.
+
+        Of two solutions it is the larger one, at which the cylinder extends with the joint
+        position.
+        """
         return np.sqrt(length**2 - self.across**2) - self.along
 
 
@@ -113,8 +118,9 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
 def has_ball_ends(machine: Machine, name: str) -> bool:
     """Return whether an axis' cylinder needs ball joints at its ends instead of pins.
 
-    A cylinder between pins parallel to the joint's axis moves in a plane perpendicular to it. Pins
-    with an offset along the axis would bend the cylinder, so it has ball ends.
+    It does if it drives a hinge directly and its two pins are offset along the joint's axis. Such a
+    cylinder does not stay in a plane perpendicular to the axis, and pins would bend it. Cylinders
+    of slides and four-bars do not.
 
     Source: Khoshzaban 1992, section 3.4.4 (p. 43).
     """
@@ -162,7 +168,8 @@ def drive_travel(machine: Machine, name: str) -> tuple[float, float] | None:
         name: axis name.
 
     Returns:
-        (low, high) of the drive's coordinate [m] or [rad]; None if it is unlimited.
+        (low, high) of the drive's coordinate [m] or [rad], for a cylinder the piston displacement.
+        None for a drive without cylinder whose joint has no range.
     """
     cylinder, limits = machine.axes[name].cylinder, joint_range_at_drive(machine, name)
     if cylinder is None:
@@ -199,7 +206,7 @@ def _build_four_bar(machine: Machine, axis: Axis) -> FourBar:
 
 
 def xz_coordinates(point) -> tuple[float, float]:
-    """Return the coordinates x and z of a point."""
+    """Return the coordinates x and z of a point (x, y, z)."""
     return point[0], point[2]
 
 
@@ -218,7 +225,7 @@ def pin_axis(machine: Machine, name: str) -> tuple[float, float, float]:
 
 
 def check_strokes(machine: Machine) -> None:
-    """Raise InputError if a cylinder's stroke does not span the range of its joint.
+    """Raise InputError if a cylinder's stroke does not span the range of its joint, with 2 mm tolerance.
 
     Args:
         machine: the machine; joints without a range are not checked.

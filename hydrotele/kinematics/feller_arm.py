@@ -47,7 +47,7 @@ class FellerGeometry:
     head_depth: float
 
     def __post_init__(self) -> None:
-        """Raise ValueError for lengths that are not finite, or not positive."""
+        """Raise ValueError if a length is not finite, or boom or stick length is not positive."""
         if not all(math.isfinite(getattr(self, one.name)) for one in fields(self)):
             raise ValueError(f"lengths must be finite: {self}")
         if not (self.boom_length > 0 and self.stick_length > 0):
@@ -69,8 +69,9 @@ class JointSolution(NamedTuple):
 
     Attributes:
         q: swing, boom, stick, tilt, head [rad].
-        is_clamped: whether the pose was out of reach and replaced by the nearest reachable one on the
-            line from the boom pin, or from the swing axis.
+        is_clamped: whether the pose was out of reach, so that `q` belongs to a reachable pose
+            nearby. The tilt pin is then moved along the line from the boom pin, or the tool is too
+            close to the swing axis.
     """
 
     q: tuple[float, float, float, float, float]
@@ -120,11 +121,11 @@ def tool_direction(q: Sequence[float]) -> np.ndarray:
 
 
 def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolution:
-    """Compute the joint angles for a tool position, attitude and head angle, with the stick hanging down.
+    """Compute the joint angles for a tool position, attitude and head angle, with a stick angle of 0 or below.
 
     The tool is offset from the arm's plane by head radius times sine of the head angle; the swing
-    angle takes this into account. The solution in which the arm reaches backwards over its own swing
-    axis is discarded. An unreachable pose is replaced by the nearest reachable pose, which
+    angle takes this into account. The solution in which the arm reaches backwards over its own
+    swing axis is discarded. An unreachable pose is replaced by the nearest reachable pose, which
     depends continuously on the requested one.
 
     Args:
@@ -149,15 +150,15 @@ def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolut
 def inverse_kinematics_for_direction(
     geometry: FellerGeometry, position: Sequence[float], direction: Sequence[float]
 ) -> tuple[JointSolution, ...]:
-    """Compute all joint angles for a tool position and a direction of its X axis.
+    """Compute all joint angles for a tool position and a direction of the tool's X axis.
 
     There are two azimuths, with the arm reaching ahead or back over its own axis, and two head
-    angles for each.
+    angles for each. The stick angle is 0 or below.
 
     Args:
         geometry: the arm.
         position: position of the tool (3,) [m].
-        direction: direction of its X axis (3,), of any nonzero length.
+        direction: direction of the tool's X axis (3,), of any nonzero length.
 
     Returns:
         The reachable solutions, those that reach ahead first; may be empty. If the direction is
@@ -230,8 +231,9 @@ def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
 def _inverse_in_plane(geometry: FellerGeometry, r: float, z: float, attitude: float, head: float) -> JointSolution:
     """Compute boom, stick and tilt angle for a tool position and attitude in the arm's plane.
 
-    `r` and `z` are distance ahead of the swing axis and height [m]. The result has swing 0 and the given
-    head angle; a position out of reach is clamped.
+    `r` and `z` are distance ahead of the swing axis and height [m]. The result has swing 0, the
+    given head angle, and a stick angle of 0 or below. If the position is out of reach, the tilt pin
+    is moved to the nearest reachable point on its line to the boom pin, and `is_clamped` is set.
     """
     g = geometry
     out = g.tilt_length + g.head_radius * math.cos(head)

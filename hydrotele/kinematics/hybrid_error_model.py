@@ -51,7 +51,14 @@ _POE_DESCRIPTIONS = {
 
 
 class GeometryBatch(NamedTuple):
-    """W geometries with errors: constants (W, n + 1, 4, 4), A and B (W, 6, 3), offsets (W, 6)."""
+    """Geometries of W hybrid robots with different errors, in the arrays that `batch_readings` needs.
+
+    Attributes:
+        constants: (W, n + 1, 4, 4) constant transforms C_0 to C_n of the carriage.
+        universal: (W, 6, 3) universal joints A_i in the connecting platform's frame [m].
+        spherical: (W, 6, 3) spherical joints B_i in the moving platform's frame [m].
+        offsets: (W, 6) leg lengths minus leg readings [m].
+    """
 
     constants: np.ndarray
     universal: np.ndarray
@@ -97,12 +104,16 @@ class ErrorModel:
 
 
 def build_error_model(robot: HybridRobot, kind: ErrorModelKind) -> ErrorModel:
-    """Define the error parameters of a hybrid robot for calibration.
+    """Build the error model of a hybrid robot, which lists the geometric errors that a calibration estimates.
 
     Args:
         robot: the nominal robot.
-        kind: `dh` for errors of D-H rows, which the robot must have, or `poe` for errors of axis lines;
-            both with errors of the legs.
+        kind: `dh` for errors of D-H rows, which the robot must have, or `poe` for errors of axis
+            lines; both with errors of the legs.
+
+    Returns:
+        The model: names, descriptions, units and scales of the parameters, carriage first, then
+        legs.
 
     Raises:
         InputError: the kind is unknown, or the robot has no D-H rows.

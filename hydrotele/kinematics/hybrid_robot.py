@@ -2,7 +2,7 @@
 
 Six legs of variable length connect universal joints A_i on the carriage's last link, the connecting
 platform, to spherical joints B_i on the moving platform. Frame 0 is that of the measurement, frame
-n that of the connecting platform (4 for four joints). Frame 5 of the document, that of the moving
+n that of the connecting platform (4 for four joints). Frame 5 of Wang 2012, that of the moving
 platform, is the end effector's.
 
 The carriage of revolute and prismatic joints is a chain of constant transforms with a motion about
@@ -84,7 +84,7 @@ class AxisRow(StrictModel):
 
 
 class PlatformFrame(StrictModel):
-    """Connecting platform with joints at zero: origin [m] and rotation vector [rad] in frame 0."""
+    """Frame of the connecting platform with all joints at zero: origin [m] and rotation vector [rad] in frame 0."""
 
     position: Vector
     rotation: Vector
@@ -96,8 +96,9 @@ _SixVectors = Annotated[tuple[Vector, ...], Field(min_length=LEG_COUNT, max_leng
 class HybridSpec(StrictModel):
     """Contents of the file of a hybrid robot.
 
-    `carriage` holds D-H rows; the last frame is that of the connecting platform. `axes` holds axis
-    lines instead, with the connecting platform's frame when all joints are at zero.
+    `carriage` holds D-H rows; the last frame is that of the connecting platform. Alternatively,
+    `axes` holds axis lines, and `platform_at_zero` the connecting platform's frame with all joints
+    at zero. The other fields correspond to the attributes of `HybridRobot`.
     """
 
     name: str
@@ -250,7 +251,11 @@ def dh_transform(theta, d, a, alpha) -> np.ndarray:
 
 
 def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
-    """Build a frame (n, 4, 4) for each joint axis: z along the axis, origin on it, in frame 0."""
+    """Build a frame for each joint axis, with z along the axis and its origin on the axis.
+
+    Returns:
+        (n, 4, 4) frames relative to frame 0, with all joints at zero.
+    """
     frames = np.tile(np.eye(4), (len(axes), 1, 1))
     for frame, row in zip(frames, axes, strict=True):
         z = np.array(row.direction) / np.linalg.norm(row.direction)
@@ -392,7 +397,7 @@ def leg_readings(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> 
 
 
 def inverse_kinematics(robot: HybridRobot, pose: PlatformPose, joints: np.ndarray) -> np.ndarray:
-    """Compute leg readings for a pose with given carriage positions, within the legs' range.
+    """Compute leg readings for a pose with given carriage positions; raise if they are out of the legs' range.
 
     The robot is redundant: ten joints for six coordinates. The carriage positions are chosen first
     and determine the leg readings.
@@ -570,7 +575,10 @@ def rotation_to_euler(rotation: np.ndarray) -> np.ndarray:
 
 
 def pose_difference(found: PlatformPose, true: PlatformPose) -> np.ndarray:
-    """Return position [m] and rotation vector [rad] (..., 6) from `true` to `found`, in frame 0."""
+    """Return the difference (..., 6) of poses in frame 0: position `found` minus `true` [m], rotation vector [rad].
+
+    The rotation vector rotates the orientation of `true` to that of `found`.
+    """
     turned = found.rotation @ np.swapaxes(true.rotation, -1, -2)
     vector = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec()
     return np.concatenate([found.position - true.position, vector.reshape(found.position.shape)], axis=-1)

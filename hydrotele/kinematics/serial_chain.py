@@ -26,9 +26,10 @@ class Element:
 
     Attributes:
         kind: translation `tx`, `ty`, `tz` [m], rotation `rx`, `ry`, `rz` [rad], or `fixed`.
-        parameter: name of its constant, "" for none.
+        parameter: name of its constant if this is a parameter of the chain, otherwise "".
         value: nominal constant [m] or [rad].
-        joint: column of the joint coordinate that is added, or None.
+        joint: index of the joint whose coordinate, times `ratio`, is added to the constant; or
+            None.
         ratio: factor of the joint coordinate.
         matrix: (4, 4) homogeneous transform of a `fixed` element.
     """
@@ -42,22 +43,26 @@ class Element:
 
 
 class ChainPoses(NamedTuple):
-    """Frames of n poses: position (n, 3) [m] and rotation (n, 3, 3), columns in the base frame."""
+    """Position (n, 3) [m] and rotation matrix (n, 3, 3) of the chain's end in the base frame, for n poses."""
 
     position: np.ndarray
     rotation: np.ndarray
 
 
 class PosesAndRates(NamedTuple):
-    """Poses with derivatives; n poses, p parameters, k joints.
+    """Poses of the chain's end, and their derivatives by p parameters and k joint coordinates; n poses.
 
     Attributes:
-        position: (n, 3) position of the end [m].
+        position: (n, 3) position of the end in the base frame [m].
         rotation: (n, 3, 3) rotation of the end.
-        position_by_parameter: (n, 3, p) derivative of the position [m/m] or [m/rad].
-        rotation_by_parameter: (n, 3, p) rotation vector in the base frame [rad/m] or [1].
-        position_by_joint: (n, 3, k) derivative of the position.
-        rotation_by_joint: (n, 3, k) rotation vector in the base frame.
+        position_by_parameter: (n, 3, p) derivative of the position by each parameter [m/m] or
+            [m/rad].
+        rotation_by_parameter: (n, 3, p) rotation vector in the base frame per unit of each
+            parameter [rad/m] or [1].
+        position_by_joint: (n, 3, k) derivative of the position by each joint coordinate [m/m] or
+            [m/rad].
+        rotation_by_joint: (n, 3, k) rotation vector in the base frame per unit of each joint
+            coordinate [rad/m] or [1].
     """
 
     position: np.ndarray
@@ -81,7 +86,7 @@ class SerialChain:
     elements: tuple[Element, ...]
 
     def __post_init__(self) -> None:
-        """Raise ValueError for repeated parameter names or joints without effect."""
+        """Raise ValueError for repeated parameter names, or a joint that moves no element."""
         names = self.parameters
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -92,17 +97,17 @@ class SerialChain:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the p constants, in the order of the elements."""
+        """Names of the p parameters (named constants), in the order of the elements."""
         return tuple(e.parameter for e in self.elements if e.parameter)
 
     @property
     def nominal_values(self) -> np.ndarray:
-        """(p,) nominal constants."""
+        """Nominal values (p,) of the parameters [m] or [rad]."""
         return np.array([e.value for e in self.elements if e.parameter])
 
     @property
     def is_angle(self) -> np.ndarray:
-        """(p,) whether a constant is an angle [rad] rather than a length [m]."""
+        """Whether each parameter (p,) is an angle [rad] rather than a length [m]."""
         return np.array([e.kind[0] == "r" for e in self.elements if e.parameter], bool)
 
 
@@ -373,7 +378,10 @@ def _check_joints(chain: SerialChain, joints: np.ndarray, constants: np.ndarray)
 
 
 def _element_coordinates(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
-    """Yield each element of a chain with its rotation angle or displacement, a number or (n,)."""
+    """Yield each element of a chain with its angle [rad] or displacement [m], scalar or (n,).
+
+    The angle or displacement is the constant plus `ratio` times the joint coordinate.
+    """
     place = 0
     for element in chain.elements:
         amount = element.value
@@ -386,7 +394,10 @@ def _element_coordinates(chain: SerialChain, joints: np.ndarray, constants: np.n
 
 
 def _apply_element(element: Element, amount, position: np.ndarray, rotation: np.ndarray):
-    """Return the position (n, 3) and rotation (n, 3, 3) of frames after one more elementary transform."""
+    """Return position (n, 3) and rotation (n, 3, 3) of n frames after one more elementary transform.
+
+    `amount` is the element's angle [rad] or displacement [m], scalar or (n,).
+    """
     if element.kind == "fixed":
         assert element.matrix is not None
         return position + rotation @ element.matrix[:3, 3], rotation @ element.matrix[:3, :3]

@@ -50,9 +50,9 @@ class RobotJoint:
     Attributes:
         name: name in the robot's file.
         kind: `revolute` or `prismatic`.
-        origin: (4, 4) its frame in the frame after the joint before [m].
-        axis: (3,) unit vector in that frame.
-        mimic: the joint of the robot that it follows, or None.
+        origin: (4, 4) transform from the frame after the preceding joint to this joint's frame [m].
+        axis: (3,) unit vector of the joint axis in this joint's frame.
+        mimic: coupling to another joint of the robot that this joint follows, or None.
     """
 
     name: str
@@ -64,7 +64,7 @@ class RobotJoint:
 
 @dataclass(frozen=True)
 class SerialRobot:
-    """A serial robot with a ball at its end.
+    """A serial robot with a ball at its end, whose position a calibration measures.
 
     Attributes:
         name: name of the robot.
@@ -142,7 +142,7 @@ def expand_mimic_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
         (m, n) positions.
 
     Raises:
-        ValueError: the number of columns is neither.
+        ValueError: the readings have neither n nor k columns.
     """
     count = readings.shape[1]
     if count == len(robot.joints):
@@ -192,7 +192,8 @@ def apply_calibrated_parameters(
         corrections: joint corrections by name.
 
     Returns:
-        The robot; with zero errors it has the poses of the calibrated chain.
+        The robot. Its own chain with zero errors has the same poses as the chain of `robot` with
+        `values`.
     """
     joints = []
     for joint in robot.joints:
@@ -213,13 +214,15 @@ def correction_names(robot: SerialRobot, gravity: bool, eccentricity: bool) -> t
 
     Args:
         robot: the robot.
-        gravity: include joint deflection under gravity: `sag.JOINT.PLACE` for a mass at a joint
-            beyond, or at the ball (`tool`); compliance times mass [rad s^2/m^2].
-        eccentricity: include `sine.JOINT` and `cosine.JOINT`, encoder errors once per turn [rad].
+        gravity: include deflections under gravity of each revolute joint. `sag.JOINT.PLACE` is the
+            compliance of JOINT times a mass at PLACE [rad s^2/m^2]. PLACE is a joint farther out,
+            or the ball (`tool`).
+        eccentricity: include `sine.JOINT` and `cosine.JOINT`, the amplitudes of the encoder error
+            once per turn of each revolute joint [rad].
 
     Returns:
-        The names. Of masses with the same torque on a joint one is included; masses without torque
-        are not included.
+        The names. If masses at several places cause the same torque on a joint, only the outermost
+        is included. Places at which a mass causes no torque are not included.
     """
     names: list[str] = []
     if gravity:
@@ -291,14 +294,15 @@ def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequen
 def compute_ball_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
     """Compute the poses of the ball at the robot's end from encoder readings, with joint corrections.
 
-    The corrections are the joint deflection under gravity and the encoder eccentricity of the robot.
+    The corrections are the joint deflection under gravity and the encoder eccentricity of the
+    robot.
 
     Args:
         robot: nominal or calibrated robot.
         joints: (n, k) encoder readings [rad] or [m].
 
     Returns:
-        n poses in the base frame.
+        n poses of the ball in the base frame.
     """
     return chain_poses(robot_chain(robot), _apply_corrections(robot, np.asarray(joints, float)))
 
@@ -322,12 +326,14 @@ def solve_joints_for_ball(
     Args:
         robot: nominal or calibrated robot.
         ball_positions: (n, 3) ball positions in the base frame [m].
-        start: (n, k) start of the joints; joints that follow others are set from these.
-        iterations: maximum number of steps.
-        idle: column of a joint that does not move, or None.
+        start: (n, k) joint positions at which the iteration starts [rad] or [m]. Joints that follow
+            others are computed from these others.
+        iterations: maximum number of steps; convergence is not checked.
+        idle: column of a joint that keeps its start position, or None.
 
     Returns:
-        (n, k) readings and (n,) remaining distances.
+        (n, k) encoder readings [rad] or [m], and (n,) remaining distances to the ball positions
+        [m].
 
     Source: Wampler 1986 (damped least squares).
     """

@@ -61,9 +61,10 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRob
             for any number.
 
     Returns:
-        The robot. The chain of a URDF or MJCF ends at the link, body or site with a usual name of
-        a tool, such as `ball`, `tcp` or `flange`, whatever `joints` is. If there is no such name, it
-        ends at the last link of the branch with this number of joints, or of the longest branch.
+        The robot. The chain of a URDF or MJCF ends at the link, body or site with a usual name of a
+        tool, such as `ball`, `tcp` or `flange`, even if its number of joints is not `joints`. If
+        there is no such name, the chain ends at the last link of the branch with `joints` joints.
+        Without such a branch, it ends at the last link of the branch with the most joints.
 
     Raises:
         InputError: there is no such robot, its file is invalid, or its number of joints differs.
@@ -100,7 +101,7 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
 
 
 def _describe_joint_count(robot: SerialRobot, columns: int) -> str:
-    """Return the message for readings whose number of columns does not suit the robot."""
+    """Return the error message for readings whose number of columns is not the number of the robot's joints."""
     names, independent = robot.joint_names, robot.independent_joint_names
     said = f"has {len(names)} moving joints up to the ball ({', '.join(names)}), but the data have {columns} columns"
     if len(independent) < len(names):
@@ -160,7 +161,7 @@ def robot_to_yaml(robot: SerialRobot, source: str) -> str:
 
     Args:
         robot: the robot; numbers keep all digits.
-        source: a sentence on the source of the numbers.
+        source: a sentence on the source of the numbers, for the field `source` of the file.
 
     Returns:
         The text.
@@ -215,10 +216,11 @@ def write_origins_to_urdf(robot: SerialRobot, text: str) -> str:
 
 
 class _End(NamedTuple):
-    """A possible end of a robot's chain: the part that has the ball, and what leads there.
+    """A possible end of a robot's chain: a link of a URDF, or a body or site of an MJCF.
 
-    `name` is that of the part, `count` the number of moving joints, `is_last` whether no other
-    part follows, `way` the joints from the base.
+    `name` is the name of this link, body or site. `count` is the number of joints between it and
+    the base. `is_last` tells that nothing is attached beyond it. `way` is the list of joints from
+    the base (URDF), or the tuple (kind, index, joint indices) of an MJCF.
     """
 
     name: str
@@ -228,7 +230,11 @@ class _End(NamedTuple):
 
 
 def _choose_end(path: Path, ends: Sequence[_End], columns: int | None) -> _End:
-    """Choose the end of a robot's chain: by its name, then by the number of columns, then the longest.
+    """Choose the end of a robot's chain by its name, then by the number of joints.
+
+    Ends without a moving joint are ignored. If names contain a word of `_BALL_NAMES`, only the ends
+    with the best rank are considered, otherwise only ends with `is_last`. Of these, ends with as
+    many joints as `columns` are preferred, then the one with the most joints.
 
     Args:
         path: file of the robot.
@@ -236,7 +242,8 @@ def _choose_end(path: Path, ends: Sequence[_End], columns: int | None) -> _End:
         columns: number of columns of the readings, or None.
 
     Returns:
-        The end. If several are equal, the one with the longest way, then the first.
+        The chosen end. Of several with equally many joints, one with `is_last` is preferred, then
+        the one with the longest `way`, then the first.
 
     Raises:
         InputError: no end has a moving joint.
@@ -302,7 +309,10 @@ def _read_urdf(path: Path, root: ElementTree.Element, columns: int | None) -> Se
 
 
 def _read_mimic(path: Path, joint: ElementTree.Element) -> Mimic | None:
-    """Read the `mimic` element of a URDF joint: the joint that it follows; None without the element."""
+    """Read the `mimic` element of a URDF joint: followed joint, multiplier and offset. None without the element.
+
+    Raises InputError if multiplier or offset is not a finite number.
+    """
     element = joint.find("mimic")
     if element is None:
         return None
@@ -384,17 +394,20 @@ def _mjcf_joint_name(model: Any, joint: int) -> str:
 
 
 def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict[int, Mimic]:
-    """Read the linear joint couplings of an MJCF; refuse other constraints between joints of the chain.
+    """Read the linear joint couplings of an MJCF that determine joints of a robot's chain.
 
     A `joint` constraint is q1 - r1 = a0 + a1 (q2 - r2) + ..., with the reference positions r.
 
     Args:
         path: the MJCF.
         model: the compiled model.
-        chain: joints of the robot.
+        chain: indices of the robot's joints.
 
     Returns:
-        Joint of the chain -> the joint that it follows.
+        Index of a joint of the chain -> its coupling to the joint that it follows.
+
+    Raises:
+        InputError: another active equality constraint determines a joint of the chain.
     """
     import mujoco
 

@@ -2,8 +2,9 @@
 
 The same equations serve the excavator (swing, boom, stick, tool) and the feller-buncher, with a
 head that rotates the tool sideways. At the head angle h the tool is `along + radius cos h` ahead of
-the tool pin and `side - radius sin h` to the left of the swing axis. `arm` and `five_dof` implement
-the same geometry with error messages; these functions return a status instead.
+the tool pin and `side - radius sin h` to the left of the swing axis. `kinematics.arm` and
+`kinematics.feller_arm` implement the same geometry with error messages; these functions return a
+status instead.
 """
 
 import math
@@ -91,8 +92,8 @@ def compute_tip_pose(arm, q, pose):
 def solve_joint_angles(g, pose, present_swing, q):
     """Compute the joint angles for a pose of the arm's tip (inverse kinematics).
 
-    Of several solutions it is the one with the tip ahead of the swing axis and the pin between boom and
-    stick above the line between the ends of both.
+    Of several solutions, the function returns that with the tip ahead of the swing axis. The pin
+    between boom and stick is then above the line from the boom pin to the outer end of the stick.
 
     Args:
         g: (9,) output of `arm_parameters`.
@@ -134,17 +135,18 @@ def solve_joint_angles(g, pose, present_swing, q):
 
 @compiled
 def compute_joint_rates(g, q, pose, rate, out):
-    """Compute the joint rates that give a rate of the tip's pose.
+    """Compute the joint rates that give a rate of the tip's pose (inverse Jacobian).
 
     Args:
         g: (9,) output of `arm_parameters`.
         q: (k,) joint angles [rad].
-        pose: (5,) pose at these angles.
-        rate: (5,) rate of the pose [m/s], [rad/s].
+        pose: (5,) pose of the tip at these angles, as written by `compute_tip_pose`.
+        rate: (5,) time derivative of r, theta, z, attitude and head [m/s], [rad/s].
         out: (k,) joint rates [rad/s], written unless the status is SINGULAR.
 
     Returns:
-        REACHED (0), or SINGULAR (2): a straight elbow, or a tip on the swing axis.
+        REACHED (0), or SINGULAR (2): boom and stick are nearly collinear, or the tip is nearly on
+        the swing axis.
 
     Source: closed-form solution of the derivative of `compute_tip_pose`.
     """

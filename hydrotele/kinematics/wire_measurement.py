@@ -35,7 +35,7 @@ class WireGeometry(StrictModel):
 
 
 class NoIntersectionError(ValueError):
-    """The wires are too short to meet, or too long to reach each other."""
+    """The wires with the given lengths have no common end point, because they are too short or too long."""
 
 
 def wire_lengths(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
@@ -100,14 +100,14 @@ def pose_from_wires(wires: WireGeometry, lengths: np.ndarray, near: PlatformPose
     Args:
         wires: geometry of the wires.
         lengths: (..., 6) lengths [m].
-        near: (...) expected poses, such as those of the nominal kinematics, which select the
-            solutions.
+        near: (...) expected poses, such as those of the nominal kinematics. Each sphere
+            intersection has two solutions; the one near the expected pose is used.
 
     Returns:
-        The poses.
+        (...) poses of the platform in frame 0.
 
     Raises:
-        NoIntersectionError: the lengths are inconsistent.
+        NoIntersectionError: no pose has these wire lengths.
     """
     lengths = np.asarray(lengths, float)
     anchors, points = np.array(wires.anchors), np.array(wires.points)

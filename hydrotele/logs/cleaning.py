@@ -84,8 +84,9 @@ class CleanedRuns(NamedTuple):
 
     Attributes:
         runs: run -> rows; removed readings are NaN.
-        notes: one sentence per removal.
-        unused_channels: one sentence per channel without a usable reading in a run, with the reason.
+        notes: one sentence per kind of fault, channel and run, on the removed readings.
+        unused_channels: one sentence per channel without a usable reading in a run, with the
+            reason.
     """
 
     runs: dict[str, RunRows]
@@ -97,7 +98,11 @@ def remove_faults(
     machine: Machine, sensors: SensorSet | None, axes: Sequence[str], channels: Sequence[str],
     noise: np.ndarray, runs: Mapping[str, RunRows],
 ) -> CleanedRuns:  # fmt: skip
-    """Replace saturated, impossible, frozen, repeated and duplicated readings by NaN.
+    """Return copies of runs in which faulty readings are NaN, with notes on the removed readings.
+
+    Faulty are infinite, saturated, impossible, frozen, repeated and duplicated readings. If the
+    removal of frozen and duplicated readings leaves a channel less than a tenth of its readings in
+    a run, all its readings in this run are removed.
 
     Args:
         machine: the machine.
@@ -128,11 +133,11 @@ def remove_faults(
 
 
 def _list_unused_channels(data: _CleaningData, before: Mapping[str, RunRows]) -> tuple[str, ...]:
-    """Return one sentence per channel of which runs have no usable reading, with the reasons.
+    """Return one sentence per channel that lost all its readings in some runs, with these runs and the reasons.
 
     Args:
-        data: the cleaned runs.
-        before: the same runs before cleaning.
+        data: the cleaned runs, and the numbers of removed readings.
+        before: the same runs before cleaning; channels that had no reading there are not listed.
     """
     reasons: dict[tuple[str, str], list[str]] = {}
     for column, channel in enumerate(data.channels):
@@ -175,7 +180,11 @@ def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noi
 
 
 def _remove_repeated_readings(data: _CleaningData, run: str, channel: str) -> list[str]:
-    """Replace readings by NaN that only repeat the last update of a slow channel; return a note."""
+    """Replace readings by NaN that only repeat the last update of a slow channel.
+
+    Returns:
+        A list with one note, or an empty list if each reading of the channel is an update.
+    """
     reading, period = data.column(channel, run), data.runs[run].period
     assert reading is not None
     every = readings_per_update(reading)
@@ -195,9 +204,11 @@ def _count_readings(data: _CleaningData) -> int:
 
 
 def _find_frozen_intervals(data: _CleaningData, run: str, channel: str) -> list[Interval]:
-    """Find the intervals in which a channel is frozen.
+    """Find the intervals of a run in which a channel is frozen, that is, repeats a value although it must change.
 
-    If its noise is known, long repetitions are a proof. Otherwise another sensor must show motion.
+    If the sensor is as noisy as stated, equal readings for longer than its noise allows are
+    sufficient. Otherwise another channel must also show that the machine moved or the pressure
+    changed.
     """
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
@@ -238,9 +249,10 @@ def _find_frozen_positions(data: _CleaningData, run: str, channel: str, axis: st
 
 
 def _first_noise_estimate(data: _CleaningData, run: str, channel: str) -> list[float]:
-    """Return a list of one noise estimate of a channel, NaN if there is none.
+    """Return a list with one noise standard deviation of a channel, estimated from readings; NaN if impossible.
 
-    The first finite estimate is taken: of this run, of other runs, of channels with an equal sensor.
+    The first finite estimate is used: from this run, from other runs, or from channels of the same
+    kind whose sensor has the same stated noise.
     """
     sensor, witnesses = data.sensor(channel), [(channel, run)]
     witnesses += [(channel, other) for other in data.runs if other != run]

@@ -40,12 +40,13 @@ class Clock(NamedTuple):
 
 
 def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
-    """Fit a uniform clock to time stamps, and assign each row to a tick of the clock.
+    """Fit a uniform clock to the time stamps of a log, and assign each row to a tick of the clock.
 
     The period is estimated by least squares, so that a slightly fast or slow clock loses no row.
-    If two rows have the same tick, the closer one is used. Stamps with jitter about the ticks are
-    assigned to the nearest tick. Rows without a common clock, as those of a loop that sleeps
-    between rows, keep their stamps: the clock is then five times as fast, with empty ticks.
+    Each row is assigned to the nearest tick. If two rows have the same tick, the closer one is
+    used. Some logs have no uniform clock, as those of a loop that sleeps between rows. For these
+    the clock has five ticks per median step, so that rows keep their times approximately and some
+    ticks have no row.
 
     Args:
         time: (n,) increasing time stamps [s].
@@ -129,9 +130,10 @@ def _make_clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str
 
 
 def _track_ticks(time: np.ndarray, period: float) -> np.ndarray:
-    """Return the ticks (n,) of time stamps (n,) [s], for irregular stamps and a slightly wrong period.
+    """Return the tick (n,) of each time stamp (n,) [s], for stamps with jitter and a slightly wrong period.
 
-    The predicted time of the next row is corrected by a tenth of each stamp's deviation.
+    The function advances a predicted time by whole periods to each stamp, and corrects it by a
+    tenth of the stamp's deviation. The first tick is 0.
     """
     tick = np.zeros(len(time), dtype=int)
     at = time[0]
@@ -161,11 +163,11 @@ _MIN_EQUAL_FRACTION = 0.99  # minimum fraction of equal rows if two files contai
 
 
 def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other_command: np.ndarray) -> float | None:
-    """Estimate the offset to add to the times of a second file [s].
+    """Estimate the offset between the clocks of two files from commands that both contain.
 
     The coarse offset maximises the correlation of the two command histories. If both files contain
-    the same rows, their stamps give the exact offset. Otherwise the offset minimises the difference
-    of the linearly interpolated commands.
+    the same rows, their stamps give the exact offset. Otherwise the offset minimises the mean
+    square difference of the linearly interpolated commands.
 
     Args:
         clock: reference clock (n rows).
@@ -174,7 +176,8 @@ def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other
         other_command: (m, k) the same commands in the second file.
 
     Returns:
-        The offset [s], None if it is not identifiable: constant commands or different signals.
+        The offset to add to the times of the second file [s]. None if it is not identifiable: the
+        commands are constant, correlate by less than 0.95, or overlap for less than 5 s.
     """
     step = min(clock.period, other.period)
     a, b = _resample_zero_order_hold(clock, command, step), _resample_zero_order_hold(other, other_command, step)

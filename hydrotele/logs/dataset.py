@@ -2,7 +2,8 @@
 
 `load_dataset` reads logs, resamples each run to a uniform clock, removes faulty readings, selects
 the channels that the model predicts, and determines their noise. One run is held out for
-validation; a single run is split in time. Truth channels and simulator metadata are removed.
+validation; a single run is split in time. Channels `truth.*` and metadata that only a simulator
+knows are removed.
 """
 
 import dataclasses
@@ -71,19 +72,19 @@ def logged_predicted_channels(files: Sequence[RunFiles], machine: Machine) -> tu
 def determine_sensors(
     files: Sequence[RunFiles], machine: Machine, name: str | None
 ) -> tuple[SensorSet | None, list[str]]:
-    """Return the set of sensors with which logs were recorded, and notes.
+    """Return the sensor set of the machine with which logs were recorded, and notes.
 
     Args:
         files: the runs.
         machine: the machine, which defines one or several sets of sensors.
-        name: name of the set; None to use the one that the metadata of the logs name, or else the
-            first one of the machine.
+        name: name of the set. None for the set that the metadata of the logs name; if they name
+            none, or one that the machine does not have, for the first set of the machine.
 
     Returns:
         (sensors, None if their noise is unknown; notes).
 
     Raises:
-        InputError: the machine has no such sensors, or the logs have different ones.
+        InputError: the machine has no set `name`, or without `name` the logs name different sets.
     """
     if name is not None:
         return get_sensor_set(machine, name), []
@@ -116,7 +117,11 @@ def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> 
 
 
 def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
-    """Return a note for each logged channel that the machine does not have, with similar names."""
+    """Return a note for each logged channel that is ignored, because the machine has no such channel.
+
+    The note suggests similar names. Channels of kinds that the model does not predict are not
+    mentioned.
+    """
     valid = (*predicted_channels(machine), *(f"command.{axis}" for axis in machine.axes))
     kinds = {name.partition(".")[0] for name in valid} | {"angle", "position"}
     notes = []
@@ -128,7 +133,7 @@ def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[st
 
 
 def note_empty_columns(files: Sequence[RunFiles], channels: Sequence[str]) -> list[str]:
-    """Return a note for each channel whose column has no reading in some runs."""
+    """Return a note for each channel whose column exists but is empty in some runs, with these runs."""
     notes = []
     for channel in channels:
         empty = [r.name for r in files for log in r.logs if channel in log and np.isnan(log[channel]).all()]
@@ -147,7 +152,10 @@ def note_averaged_commands(files: Sequence[RunFiles]) -> list[str]:
 
 
 def note_runs_without_motion(runs: Mapping[str, RunRows], channels: Sequence[str], noise: np.ndarray) -> list[str]:
-    """Return a note for each run in which no position changes by more than ten noise deviations."""
+    """Return a note for each run in which no position or length changes by more than ten noise standard deviations.
+
+    `noise` (c,) holds the noise standard deviations of the channels; NaN counts as 0.
+    """
     notes = []
     places = [c for c, name in enumerate(channels) if not name.startswith("pressure")]
     for name, rows in runs.items():
@@ -195,7 +203,7 @@ class RunPart(NamedTuple):
 
 
 class Split(NamedTuple):
-    """Runs whose parameters are fitted, and the run that is held out for validation."""
+    """Runs to which parameters are fitted, and the run that is held out for validation."""
 
     fit: tuple[RunPart, ...]
     heldout: RunPart
@@ -221,20 +229,26 @@ def split_runs(
 ) -> tuple[Split, tuple[str, ...]]:
     """Split runs into fit runs and one held-out run.
 
-    The held-out run is the given one, otherwise the first of the runs `test*`, `heldout*` and
-    `validation*`, otherwise the last by name. A single run is fitted on its first three quarters,
-    or on less if the machine is at rest after them.
+    The held-out run is `heldout`, otherwise the first run whose name begins with `test`, `heldout`
+    or `validation` (unless all do), otherwise the last by name. Of a held-out run in several pieces
+    only the longest piece is used. All other runs are fitted, but if `heldout` is None, further
+    runs with such names are not used.
+
+    If all pieces belong to one run, the held-out piece is the last one with 15 to 60 % of the total
+    duration. If there is only one piece, its first three quarters are fitted, or less if the
+    machine is at rest after them; the remaining rows are held out.
 
     Args:
         runs: name of run or piece -> rows, at least one.
         origin: the same names -> name of the logged run.
-        heldout: name of a run, or None.
+        heldout: name of the run to hold out, or None.
 
     Returns:
         (split, notes on runs that are neither fitted nor held out).
 
     Raises:
-        InputError: the run does not exist, no run remains to fit, or a single run is too short.
+        InputError: the run `heldout` does not exist, no run remains to fit, or a single run is too
+            short.
     """
     names = sorted(set(origin.values()))
     if heldout is not None and heldout not in names:
@@ -299,11 +313,11 @@ def _split_in_time(name: str, rows: RunRows) -> Split:
 
 
 def _count_fit_rows(rows: RunRows) -> int:
-    """Return the number of first rows of a single run to fit; the others are held out.
+    """Return how many rows at the beginning of a single run are fitted; the others are held out.
 
-    They are three quarters of the rows. A machine at rest cannot validate a model: if less than 10 % of
-    the command changes are in the last quarter, the held-out part begins earlier. It then contains a
-    quarter of the command changes, but at most half of the run.
+    These are three quarters of the rows. A machine at rest cannot validate a model: if less than
+    10 % of the command changes are in the last quarter, the held-out part begins earlier. It then
+    contains a quarter of the command changes, but at most half of the run.
     """
     n = len(rows.command)
     passed = np.cumsum(np.abs(np.diff(rows.command, axis=0, prepend=rows.command[:1])).sum(axis=1))
@@ -331,9 +345,9 @@ def make_piece_log(
     logs: Sequence[Log], name: str, rows: RunRows, axes: Sequence[str], channels: Sequence[str],
     as_logged: bool = True,
 ) -> Log:  # fmt: skip
-    """Return the log of a run or of a piece of it.
+    """Return the log of a run or of a piece of a run.
 
-    The rows of several files are on a common clock; see `merge_runs`.
+    `rows` are on a uniform clock, to which `merge_runs` resamples the files of a run.
 
     Args:
         logs: the log files of the run.
@@ -341,7 +355,8 @@ def make_piece_log(
         rows: rows of the run or piece.
         axes: the nu axes.
         channels: the c channels.
-        as_logged: whether the rows are the logged ones; False for averaged or masked rows.
+        as_logged: whether readings and commands of `rows` are the logged ones; False for averaged
+            or masked rows.
 
     Returns:
         For a single file, the logged rows with their time stamps and all columns. Otherwise a log
@@ -367,7 +382,9 @@ def make_piece_log(
 def make_complete_logs(files: Sequence[RunFiles], merged: "MergedRuns", machine: Machine) -> tuple[Log, ...]:
     """Return one log per run or piece, with a command in every row and all positions in the first row.
 
-    A run of uniform rows without missing cells is returned as logged, with all columns.
+    Rows before the first one with all logged axis positions are removed. If no row or command of a
+    single-file run is missing, its rows are returned as logged, with all columns. Otherwise they
+    are on a uniform clock, with commands and predicted channels only.
 
     Args:
         files: the runs.
@@ -402,8 +419,8 @@ class RunData:
         start: time of the first row [s].
         period: time between rows [s].
         command: (n, nu) commands in actuator order, held until the next row [1], [V] or [N].
-        command_known: (n,) whether the row was logged and may be used; a missing row repeats the
-            last command.
+        command_known: (n,) whether the command of the row was logged and the row may be used; a
+            missing row repeats the last command.
         reading: (n, c) sensor readings of the channels of the dataset [SI], NaN where missing.
         log: the log without truth. For an averaged or masked run it has the commands and channels
             of this record.
@@ -460,7 +477,10 @@ class Dataset:
     unused_channels: tuple[str, ...] = ()
 
     def noise_of(self, run: RunData) -> np.ndarray:
-        """Return the noise standard deviations (c,) of a run [SI]; averaging reduces them."""
+        """Return the noise standard deviations (c,) of the readings in a run [SI].
+
+        For a mean of N logged readings it is that of one reading divided by sqrt(N).
+        """
         return self.noise if run.readings_per_mean is None else self.noise / np.sqrt(run.readings_per_mean)
 
 
@@ -480,15 +500,18 @@ def load_dataset(
     NaN, even if its converter step is known, because the noise may be larger than the step.
 
     Args:
-        paths: folder with logs, run folder, file, or several of them; see `files`.
+        paths: folder with logs, run folder, file, or several of them; see `logs.run_files`.
         machine: the model.
         sensors: name of the sensors of the machine, or `ideal` if their noise is unknown. The
             default is the metadata of the logs, or else the first sensors of the machine.
         heldout: name of the run for validation; see `split_runs`.
         aliases: column name in the files -> channel, in addition to `log_columns` of the machine.
         force: accept logs whose metadata names another machine or tool.
-        mask: file of masked intervals, see `rows.read_mask`. A log may also have a column `valid`
-            or `mask`.
+        mask: file of masked intervals, see `masked_intervals.read_mask`. A log may also have a
+            column `valid` or `mask`.
+
+    Returns:
+        The dataset: fit runs, held-out run, channels with their noise, and notes.
 
     Raises:
         InputError: a file is invalid, is from another machine, has no command of an axis or values
@@ -508,7 +531,7 @@ def make_dataset(
     heldout: str | None = None,
     masks: Sequence[MaskedInterval] = (),
 ) -> Dataset:
-    """Prepare logs in memory for identification; their readings may be NaN where missing.
+    """Make a dataset for identification from logs in memory; their readings may be NaN where missing.
 
     Args:
         files: the runs, sorted by name.
@@ -583,10 +606,10 @@ class MergedRuns(NamedTuple):
 
 
 def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[MaskedInterval] = ()) -> MergedRuns:
-    """Resample runs to uniform clocks and check that their channels and values fit a machine.
+    """Resample runs to uniform clocks, and check that their channels and values fit a machine.
 
-    All commands of the program accept or refuse logs by this function. Some require more: a command
-    of every axis, or a minimum duration.
+    All subcommands of the command-line program accept or refuse logs by this function. Some of them
+    require more: a command channel of every axis, or a minimum duration.
 
     Args:
         files: the runs.
@@ -594,8 +617,9 @@ def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[Mask
         masks: time intervals whose readings are not used.
 
     Raises:
-        InputError: no channel is of the machine, the time stamps follow no clock, too many rows are
-            missing, or values are outside the range of the machine.
+        InputError: no channel is one that the model predicts, the time stamps follow no clock, more
+            than 30 % of the rows are missing, or most values of a channel are outside the range of
+            the machine.
     """
     axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
     pieces, origin, notes = {}, {}, []

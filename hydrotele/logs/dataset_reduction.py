@@ -13,10 +13,11 @@ MAX_FIT_SECONDS = 150.0  # s, maximum total duration of the fit runs: about four
 
 
 def select_exciting_segments(data: Dataset, max_seconds: float = MAX_FIT_SECONDS) -> Dataset:
-    """Shorten the fit runs to the segments with the largest command changes.
+    """Shorten each fit run to its segment with the largest command changes.
 
-    Every run is shortened by the same factor, so that their total duration is at most the maximum. A
-    note states each segment. The held-out run is not changed.
+    All runs are shortened by the same factor, so that their total duration is `max_seconds`. The
+    changes of each command are divided by its standard deviation over all fit runs. A note states
+    each segment. The held-out run is not changed.
 
     Args:
         data: the dataset.
@@ -39,10 +40,12 @@ def select_exciting_segments(data: Dataset, max_seconds: float = MAX_FIT_SECONDS
 
 
 def downsample(data: Dataset) -> Dataset:
-    """Reduce the sample rate of all runs of a dataset by averaging rows.
+    """Return a dataset in which the sample rate of all runs is reduced by averaging rows.
 
-    The rate is six times the bandwidth of the fastest valve, at least 100 Hz. Higher rates add little
-    information, because mass, friction and leakage act more slowly than the valves.
+    The new rate is at most about six times the bandwidth of the fastest valve or 100 Hz, whichever
+    is larger. Higher rates add little information, because mass, friction and leakage act more
+    slowly than the valves. Runs shorter than 2 s, or with a rate below 1.33 times this limit, are
+    not changed.
     """
     bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
     rate = max(_MIN_RATE, _ROWS_PER_CYCLE * max(bandwidths, default=0.0))
@@ -67,8 +70,8 @@ def downsample(data: Dataset) -> Dataset:
 def find_exciting_segment(run: RunData, rows: int) -> slice:
     """Return the `rows` consecutive rows of a run with the largest command changes, as a slice.
 
-    The changes of each command are divided by its standard deviation in the run. A shorter run is
-    returned as a whole.
+    The changes of each command are divided by its standard deviation in the run. If the run has
+    fewer rows, the slice covers all of them.
     """
     if rows >= len(run.command):
         return slice(0, len(run.command))

@@ -1,14 +1,14 @@
 """Detection of implausible, saturated, frozen, repeated and duplicated readings, and of spikes.
 
-A slow channel repeats its value between two updates. For example, a 1 kHz logger writes a pressure
-that arrives every 20 ms 20 times. If all were used, one error would count 20 times, and the age of the
-value would appear as a delay between 0 and 20 ms.
+A slow channel repeats its value between two updates. For example, a 1 kHz logger writes each value
+of a pressure that arrives every 20 ms 20 times. If all 20 readings were used, one error would count
+20 times, and the age of the value would appear as a delay between 0 and 20 ms.
 
 A noisy sensor rarely gives the same value twice in a row. If its error is uniform in +-a and the
-converter rounds to steps of q, the probability is at most q / 2a. If its error is normal with standard
-deviation sigma, it is at most q / (sigma sqrt(2 pi)). A long repetition is then not random. This applies
-only if the sensor is as noisy as its data sheet states. Otherwise repetitions at rest are normal, and
-only the motion of other channels can prove that a sensor is frozen.
+converter rounds to steps of q, the probability is at most q / 2a. If its error is normal with
+standard deviation sigma, it is at most q / (sigma sqrt(2 pi)). A long repetition is then not
+random. This applies only if the sensor is as noisy as its data sheet states. Otherwise repetitions
+at rest are normal, and only the motion of other channels can prove that a sensor is frozen.
 """
 
 import math
@@ -34,7 +34,7 @@ _SATURATION_MARGIN_STDS = 3.46  # standard deviations from the limit within whic
 def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
     """Return the range in which readings of a channel are plausible for a machine.
 
-    It follows from joint ranges, strokes and relief pressures, each with a tolerance.
+    The range follows from joint ranges, strokes and relief pressures, each with a tolerance.
 
     Args:
         machine: the machine.
@@ -59,7 +59,7 @@ def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
 
 
 def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str) -> None:
-    """Check that at least half of the readings of a channel are in the range of the machine.
+    """Check that at least half of the readings of a channel are in the machine's `plausible_range`.
 
     Args:
         machine: the machine.
@@ -91,9 +91,10 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
 def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
     """Find readings at the limit of the sensor's span, and those close to it in time and value.
 
-    While a sensor is saturated, noise moves some readings inwards. Keeping these would bias the
-    channel. Therefore readings within 0.1 s of a saturated one are also found, if they are closer to the
-    limit than the noise of the sensor.
+    While a sensor is saturated, noise moves some readings away from the limit. Keeping these would
+    bias the channel. Therefore readings within 0.1 s of a saturated one are also found, if their
+    distance from the limit is at most the range of the sensor's noise: twice its accuracy, or 3.46
+    standard deviations, plus one converter step.
 
     Args:
         sensor: sensor of the channel, with its span.
@@ -120,18 +121,18 @@ def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: fl
 
 
 def find_spikes(machine: Machine, channel: str, reading: np.ndarray, period: float, noise: float) -> np.ndarray:
-    """Find single readings that are physically impossible.
+    """Find readings that are physically impossible: outside the plausible range, or single spikes.
 
-    Pressures are checked against `plausible_range` only, because they can change by 10 MPa within a row. A
-    position is also a spike if its two neighbours agree and it differs from them by more than any
-    acceleration can explain.
+    Pressures are checked against `plausible_range` only, because they can change by 10 MPa within a
+    row. A position or length is also a spike if its two neighbours agree and it differs from their
+    mean by more than 20 noise standard deviations and by more than any acceleration can explain.
 
     Args:
         machine: the machine.
         channel: channel name.
         reading: (n,) readings, NaN where missing [channel's unit].
         period: time between rows [s].
-        noise: noise standard deviation [channel's unit]; NaN: estimated from the readings.
+        noise: noise standard deviation [channel's unit]; NaN to estimate it from the readings.
 
     Returns:
         (n,) whether a reading is impossible.
@@ -193,9 +194,10 @@ def readings_per_update(reading: np.ndarray) -> float:
 
 
 def find_readings_without_update(reading: np.ndarray, per_update: float) -> np.ndarray:
-    """Find readings that repeat the previous one only because the channel was not updated.
+    """Find readings that repeat the previous one only because a slow channel was not updated.
 
-    If a value lasts longer than one update period, the readings at which an update is due count as new.
+    If a value lasts longer than one update period, the readings at which an update is due count as
+    updates with the same value, and are not found.
 
     Args:
         reading: (n,) readings, NaN where missing.
@@ -238,10 +240,11 @@ class Interval(NamedTuple):
 
 
 def equal_reading_probability(sensor: Sensor, channel: str) -> float | None:
-    """Return the largest probability that a noisy sensor gives the same reading twice [1].
+    """Return the largest probability that a noisy sensor gives the same reading twice in a row [1].
 
-    The result is None if the noise is unknown or less than the converter step, so that equal readings
-    of a constant value are normal.
+    It is the converter step times the largest probability density of the sensor's error. The result
+    is None if the noise is unknown, or if the probability exceeds 0.5, so that equal readings of a
+    constant value are normal.
 
     >>> equal_reading_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
     0.0625
@@ -254,12 +257,14 @@ def equal_reading_probability(sensor: Sensor, channel: str) -> float | None:
 
 
 def min_suspicious_repeat(probability: float, count: int) -> int:
-    """Return how many consecutive equal readings are too improbable to be random.
+    """Return the number of consecutive equal readings that is too improbable to be random.
+
+    With this number, the probability of a random repetition anywhere in the data set is at most
+    1e-6.
 
     Args:
         probability: probability that two consecutive readings are equal [1].
-        count: number of readings in the data set, in which such a repetition may occur by chance with a
-            probability of 1e-6.
+        count: number of readings in the data set.
 
     >>> min_suspicious_repeat(0.1, 90_000)
     12
@@ -268,7 +273,7 @@ def min_suspicious_repeat(probability: float, count: int) -> int:
 
 
 def find_constant_intervals(reading: np.ndarray, min_length: int) -> list[Interval]:
-    """Find intervals of at least `min_length` equal readings; missing readings count as equal.
+    """Find intervals with at least `min_length` equal consecutive readings; missing readings (NaN) are skipped.
 
     >>> find_constant_intervals(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
     [Interval(first=1, last=5)]
@@ -284,10 +289,10 @@ def find_constant_intervals(reading: np.ndarray, min_length: int) -> list[Interv
 
 
 def are_repeats_at_extreme(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
-    """Return whether a channel is saturated rather than frozen.
+    """Return whether repeated readings of a channel show that it is saturated rather than frozen.
 
-    It is if it repeats readings in several intervals, all at the same value, and this value is the
-    minimum or maximum of the run.
+    It is saturated if there are several intervals of repeated readings, all at the same value, and
+    this value is the minimum or maximum of the run.
 
     >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
     >>> are_repeats_at_extreme(reading, find_constant_intervals(reading, 2))
@@ -332,7 +337,7 @@ def is_noise_as_stated(sensor: Sensor, channel: str, noise_estimates: Sequence[f
 
 
 def find_frozen_by_noise(reading: np.ndarray, probability: float, count: int, period: float) -> list[Interval]:
-    """Find intervals of equal readings that are longer than the noise of the sensor allows.
+    """Find intervals of equal readings that are longer than the noise of the sensor allows, and than 0.1 s.
 
     Args:
         reading: (n,) readings of one run, NaN where missing.
@@ -350,15 +355,16 @@ def find_frozen_position(
 ) -> list[Interval]:  # fmt: skip
     """Find intervals of at least 1 s in which a position is constant although the axis must have moved.
 
-    There are two proofs of motion. The second position sensor of the axis (length or angle) changed. Or
-    the axis had large commands in both directions, other axes moved, and the value is not at an end
-    of its range.
+    Motion is proved in one of two ways. First, the second position sensor of the axis (length or
+    angle) changed by more than 5 % of its range and more than 20 resolution steps. Second, the
+    command exceeded half its limit for 1 s in each direction, another axis moved by more than a
+    tenth of its range, and the constant value is not at an end of the channel's range.
 
     Args:
         reading: (n,) positions, NaN where missing [channel's unit].
         partner: (n,) readings of the second position sensor of the axis, or None.
         command: (n,) command of the axis divided by its limit [1].
-        others: (n, k) positions of other axes.
+        others: (n, k) positions of k other axes.
         step: resolution of the sensor [channel's unit].
         ranges: range of the channel and of its partner over all runs, each in its unit; 0 for a
             channel that is constant in all runs.
@@ -387,13 +393,15 @@ def find_frozen_position(
 
 
 def find_frozen_pressure(reading: np.ndarray, partner: np.ndarray, lowest: float, period: float) -> list[Interval]:
-    """Find intervals of constant pressure in one chamber while that of the other chamber changes.
+    """Find intervals of at least 1 s with constant pressure in one chamber while the other one's changes by 2 MPa.
+
+    Intervals at a pressure of at most `lowest` are not found.
 
     Args:
         reading: (n,) pressures, NaN where missing [Pa].
         partner: (n,) pressures of the other chamber [Pa].
-        lowest: pressure below which a make-up valve, which refills the chamber, may keep the pressure
-            constant [Pa].
+        lowest: pressure below which a make-up valve, which refills the chamber, may keep the
+            pressure constant [Pa].
         period: time between rows [s].
     """
     return [
@@ -411,12 +419,14 @@ def _robust_range(values: np.ndarray) -> float:
 
 
 def find_duplicated_rows(reading: np.ndarray, probability: Sequence[float | None], count: int) -> np.ndarray:
-    """Find rows that repeat all readings of the previous row, which noise makes improbable.
+    """Find rows that repeat all readings of the previous row, although noise makes this improbable.
+
+    The probability of such a repetition anywhere in the data set must be below 1e-6.
 
     Args:
         reading: (n, c) readings, NaN where missing.
-        probability: per channel the probability that two consecutive readings are equal [1]; None to
-            ignore a channel.
+        probability: per channel the probability that two consecutive readings are equal [1]; None
+            to ignore a channel.
         count: number of readings in the whole data set.
 
     Returns:

@@ -55,14 +55,18 @@ def convert_mask_column(table: Table) -> Table:
 
 
 def normalise_commands(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
-    """Convert commands in volts, mA or counts to fractions in [-1, 1].
+    """Convert command columns in volts, mA or counts to fractions in [-1, 1].
 
-    Columns in percent or as a fraction are left to the conversion to SI. Readings up to 2 % beyond
-    the range, as converters give them, are clipped to it.
+    Columns in percent or as a fraction are not changed here, but by `check_and_convert_table`.
+    Commands up to 2 % beyond the range, as converters give them, are clipped to the range.
 
     Args:
         table: table with channel names.
-        ranges: command channel -> range of its column.
+        ranges: command channel -> values of the column that correspond to -1 and 1, with their
+            unit.
+
+    Returns:
+        The table with the converted columns.
 
     Raises:
         InputError: a column has another unit or exceeds its range; the message gives the remedy.
@@ -202,9 +206,10 @@ def _check_finite(table: Table, missing: bool) -> None:
 
 
 def count_missing_samples(time: np.ndarray) -> np.ndarray:
-    """Return how many samples are missing in each step between time stamps (n,) [s]; result (n-1,).
+    """Return the number of samples (n - 1,) that are missing in each step between time stamps (n,) [s].
 
-    A step that differs from the median by at most half of it has none; a shorter one counts as one.
+    A step that differs from the median step by at most half of it has 0. For longer steps the
+    number is step over median minus 1, rounded. Shorter steps are irregular and count as 1.
     """
     with np.errstate(all="ignore"):
         step = np.diff(time)
@@ -215,6 +220,8 @@ def count_missing_samples(time: np.ndarray) -> np.ndarray:
 def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, stated: bool) -> None:
     """Check that the magnitudes of a column are plausible for its unit, to find wrong units.
 
+    A column `valid` must contain only 0 and 1.
+
     Args:
         table: table of the column, for messages.
         name: channel.
@@ -223,7 +230,8 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
         stated: whether the file states the unit; the limits are then wider.
 
     Raises:
-        InputError: they are not; the message names the unit that the values probably have.
+        InputError: a value is not plausible; the message names the unit that the values probably
+            have.
     """
     size = np.abs(values[np.isfinite(values)])
     if not len(size):
@@ -260,11 +268,12 @@ class Log:
 
     Attributes:
         time: (n,) float64 [s], strictly increasing.
-        columns: channel name (see `signals`) -> (n,) float64 in the unit of `units`.
+        columns: channel name (see `machine.log_channels`) -> (n,) float64 in the unit of `units`.
         units: channel name -> SI unit; the same keys as `columns`.
         metadata: metadata such as machine and sensors; structures as JSON text.
         source: file of the log, or the name of the program part that created it.
-        origin: time stamp of the file at time 0 [s].
+        origin: time stamp in the file that corresponds to time 0 [s]; 0 unless the stamps are
+            calendar time.
         notes: repairs by the reader, one sentence each.
 
     Raises:
@@ -302,7 +311,7 @@ class Log:
         return len(self.time)
 
     def __contains__(self, name: object) -> bool:
-        """Return whether the log has a channel."""
+        """Return whether the log has a channel of this name; `time` counts as a channel."""
         return name == "time" or name in self.columns
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -322,7 +331,7 @@ class Log:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Axes of the measured channels, in order of appearance."""
+        """Names of the axes of all channels except `truth.*`, in order of appearance."""
         channels = map(log_channels.parse_channel, self.columns)
         return tuple(dict.fromkeys(c.axis for c in channels if c.axis and not c.truth))
 
@@ -333,7 +342,7 @@ class Log:
 
     @property
     def gaps(self) -> np.ndarray:
-        """Rows (k,) before which the time step differs from the median step by more than half of it."""
+        """Indices (k,) of the rows whose time step from the previous row differs from the median by more than half."""
         return np.flatnonzero(count_missing_samples(self.time)) + 1
 
     def __repr__(self) -> str:
@@ -362,7 +371,7 @@ class Log:
 
 
 def find_log_in_folder(folder: Path, stem: str = MEASURED_STEM) -> Path | None:
-    """Return the file `<stem>.parquet` or `<stem>.csv` of a run folder, or None for other folders."""
+    """Return the file `<stem>.parquet` or `<stem>.csv` of a run folder; None if the folder has neither."""
     return next((file for kind in LOG_SUFFIXES if (file := folder / f"{stem}{kind}").is_file()), None)
 
 
@@ -377,8 +386,8 @@ def load_log(
 ) -> Log:
     """Read and check one run from a `.parquet` or `.csv` file or from a run folder.
 
-    Empty cells become NaN, rows may be missing (`Log.gaps` lists them), and time stamps are repaired,
-    see `stamps.repair_time_stamps`; the notes of the log state the repairs.
+    Empty cells become NaN, rows may be missing (`Log.gaps` lists them), and time stamps are
+    repaired, see `time_stamps.repair_time_stamps`; the notes of the log state the repairs.
 
     Args:
         path: the file, or the folder of a run, whose measured log is read.
@@ -391,6 +400,9 @@ def load_log(
         complete: refuse empty cells and time stamps that need a repair, for tables of commands.
         commands: command channel -> range of its column, for commands that are not fractions in
             [-1, 1]; ignored for logs written by hydrotele.
+
+    Returns:
+        The log in SI units.
 
     Raises:
         InputError: the file is invalid; the message gives file, column, row and remedy.
@@ -502,7 +514,7 @@ def find_logs(path: Path) -> list[tuple[str, Path]]:
 
 
 def save_log(log: Log, path: str | os.PathLike) -> None:
-    """Write a log atomically as Parquet: an error leaves an existing file unchanged.
+    """Write a log to a Parquet file, which an error during writing leaves unchanged if it exists.
 
     Raises:
         InputError: a value is not finite, time does not increase, the name does not end in

@@ -16,7 +16,7 @@ _MASK_HEADER = ("run", "begin", "end")
 
 
 class MaskedInterval(NamedTuple):
-    """Interval of a run whose readings are not used, from `begin` to `end` [s] of its time stamps.
+    """Interval of a run whose readings are not used: time stamps `begin` <= t < `end` [s].
 
     An empty run name means all runs.
     """
@@ -32,8 +32,12 @@ def read_mask(path: str | Path) -> tuple[MaskedInterval, ...]:
     Args:
         path: the file; an empty run means all runs, an empty time the start or end of the run.
 
+    Returns:
+        The intervals, in the order of the file.
+
     Raises:
-        InputError: the file does not exist, or a line is invalid; the message names the line.
+        InputError: the file does not exist or has no interval, or a line is invalid; the message
+            names the line.
     """
     path = Path(path)
     lines = read_text(path).splitlines()
@@ -62,7 +66,7 @@ def read_mask(path: str | Path) -> tuple[MaskedInterval, ...]:
 
 
 def check_mask_runs(masks: Sequence[MaskedInterval], runs: Sequence[str]) -> None:
-    """Check that the runs of all masked intervals exist.
+    """Check that the run of every masked interval is one of `runs`.
 
     Raises:
         InputError: a run does not exist; the message lists the runs.
@@ -76,7 +80,7 @@ def check_mask_runs(masks: Sequence[MaskedInterval], runs: Sequence[str]) -> Non
 
 
 def find_unmasked_rows(masks: Sequence[MaskedInterval], run: str, time: np.ndarray) -> np.ndarray:
-    """Return (n,) whether rows of a run at times (n,) [s] are outside all masked intervals.
+    """Return for each row of a run whether it is outside all masked intervals (n,), from its time stamp (n,) [s].
 
     >>> find_unmasked_rows([MaskedInterval("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
     [True, False, False, True]

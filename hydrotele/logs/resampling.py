@@ -49,21 +49,22 @@ def merge_run(
     channels: Sequence[str],
     masks: Sequence[MaskedInterval] = (),
 ) -> tuple[tuple[RunRows, ...], tuple[str, ...]]:
-    """Merge the files of a run on one clock and split it at gaps and masked intervals.
+    """Merge the files of a run on one uniform clock, and split the run at gaps and masked intervals.
 
-    The file with the commands defines the clock. If other files have rows between its rows, the
-    clock is made up to five times finer, so that every reading keeps its time. Rows without a
-    reading are NaN.
+    The file with the most commands defines the clock. If other files have rows between its rows,
+    the period is divided by up to five, so that every reading keeps its time. Readings are NaN at
+    ticks for which the files have none.
 
     Args:
         run: the files of the run.
         axes: the nu axes.
         channels: the c channels.
-        masks: masked intervals, in addition to the `valid` columns of the files.
+        masks: masked intervals, in addition to the rows with `valid` 0 in the files.
 
     Returns:
-        (pieces of the run, notes). The run is split at gaps of more than 1 s and at masked
-        intervals of more than 0.2 s.
+        (pieces of the run, notes). The run is split at gaps of more than 1 s between rows and at
+        masked intervals of more than 0.2 s. The masked intervals at which it is split belong to no
+        piece.
 
     Raises:
         InputError: time stamps follow no clock.
@@ -115,11 +116,14 @@ def merge_run(
 
 
 def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[MaskedInterval]) -> RunRows:
-    """Return the rows with readings set to NaN in masked intervals and where `valid` is not 1.
+    """Return merged rows with `valid` set to False and readings to NaN in masked rows.
+
+    Masked are rows within a masked interval, and rows for which the column `valid` of a log is not
+    1.
 
     Args:
         run: the files of the run.
-        logs: their logs, the one with the commands first.
+        logs: logs of the run, the one with the commands first.
         clocks: clocks of the logs.
         rows: the merged rows.
         masks: masked intervals.
@@ -136,7 +140,7 @@ def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[Mas
 
 
 def _split_at_masks(rows: RunRows) -> list[RunRows]:
-    """Split a run at masked intervals of more than 0.2 s and return the parts between them."""
+    """Split a run at masked intervals of more than 0.2 s, and return the parts before, between and after these."""
     edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
     begin, end = edges[::2], edges[1::2]
     long = (end - begin) * rows.period > MAX_MASK_SECONDS
@@ -181,7 +185,8 @@ def _determine_clock_offset(run: RunFiles, main: Log, clock: Clock, log: Log, ot
         commands: names of the command channels; those in both logs determine the offset.
 
     Returns:
-        The offset, 0 if it cannot be determined.
+        (offset, notes). If the commands do not determine the offset, it is 0. If the time stamps of
+        both files do not overlap either, it makes both files begin at the same time.
     """
     both = [name for name in commands if name in main and name in log]
     named = f"{run.name}: {log.source}"
@@ -215,7 +220,11 @@ def _are_disjoint(clock: Clock, other: Clock) -> bool:
 
 
 def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
-    """Find a common clock with a tick for every row of several clocks.
+    """Find the period of a common clock with a tick for every row of several clocks.
+
+    The period of the first clock is divided by 1 to 5. The first of these divisors is used with
+    which the time errors are at most 5 % of that period, otherwise the divisor with the smallest
+    error.
 
     Returns:
         (period [s], ticks per period of the first clock, largest time error of a row [s]).
@@ -240,7 +249,7 @@ def _common_ticks(clock: Clock, start: float, period: float) -> np.ndarray:
 
 
 def _place_on_ticks(logs, clocks, ticks, every, names) -> np.ndarray:
-    """Return the columns of all files at the ticks of the common clock.
+    """Return channels of all files as a table with one row per tick of the common clock.
 
     Args:
         logs: logs of the files.
@@ -272,6 +281,10 @@ def _make_uniform_rows(start, period, fine, tick, command, commanded, reading) -
         command: (m, nu) commands, NaN where missing; each is held until the next one.
         commanded: (m,) whether the commands of a row were logged.
         reading: (m, c) readings, NaN where missing.
+
+    Returns:
+        The rows from the first to the last tick. Readings at ticks without a row are NaN. Commands
+        before the first logged one are equal to it.
     """
     n = int(tick[-1] - tick[0]) + 1
     place = tick - tick[0]
@@ -309,8 +322,10 @@ def average_rows(rows: RunRows, max_rate: float = MAX_RATE) -> tuple[RunRows, np
         max_rate: maximum rate [Hz].
 
     Returns:
-        (the averaged run; (c,) effective number of independent logged readings in one mean; number of
-        logged rows per row, 1 if the rate is low enough).
+        (averaged run, readings per mean, rows per mean). Readings per mean (c,) is the effective
+        number of independent logged readings in one mean of a channel, its median over the run.
+        Rows per mean is the number of logged rows per new row; it is 1, and the run unchanged, if
+        the rate is low enough.
     """
     count = math.ceil(1.0 / (max_rate * rows.period) - _RATE_TOLERANCE)
     ones = np.ones(rows.reading.shape[1])

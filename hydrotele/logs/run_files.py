@@ -17,7 +17,7 @@ from hydrotele.machine.machine import Machine
 
 
 class RunFiles(NamedTuple):
-    """The logs of one run; several if the run has several files."""
+    """Name of a run and its logs, one per file of the run."""
 
     name: str
     logs: tuple[Log, ...]
@@ -73,10 +73,11 @@ def read_runs(
 
 
 def align_time_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
-    """Return the logs of one run with times counted from the same instant.
+    """Return the logs of one run with their times shifted so that all are counted from the same instant.
 
-    Times of a log are counted from its `origin`, if its stamps are calendar time. If some logs of the run
-    have calendar time and others have not, all are returned unchanged.
+    The times of a log with calendar time stamps are counted from its `origin`. The logs are shifted
+    to the origin that is closest to 0. If only some of the logs have calendar time, all are
+    returned unchanged.
     """
     origins = [log.origin for log in logs]
     first = min(origins, key=abs)
@@ -86,9 +87,12 @@ def align_time_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
 
 
 def command_ranges(machine: Machine) -> dict[str, CommandRange]:
-    """Return command channel -> range and unit, for commands that are not fractions in [-1, 1].
+    """Return the range and unit of each command channel that logs do not contain as a fraction in [-1, 1].
 
-    Logs contain these commands for example in volts; the ranges are stated in the machine file.
+    Logs contain these commands for example in volts. The machine file states the ranges.
+
+    Returns:
+        Command channel -> range.
     """
     return {
         f"command.{name}": CommandRange(axis.command_unit, *axis.command_range)
@@ -138,7 +142,7 @@ def _check_machine(log: Log, machine: Machine) -> None:
 
 
 def check_commands(run: RunFiles, machine: Machine) -> None:
-    """Check that a run has the command of every axis in the unit of its drive.
+    """Check that a run contains the command of every axis of a machine, in the unit of the axis' drive.
 
     Raises:
         InputError: a command is missing or has another unit; the message gives file and remedy.

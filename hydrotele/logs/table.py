@@ -95,7 +95,7 @@ def read_table(path: Path, missing: bool = False) -> Table:
     Args:
         path: the file.
         missing: read empty cells as NaN, and report columns that contain other things than numbers
-            as `faults`, instead of refusing both.
+            as `faults` of the table. If False, both raise an InputError.
 
     Raises:
         InputError: the file cannot be read.
@@ -131,17 +131,19 @@ def read_csv(path: Path, missing: bool = False) -> Table:
     """Read a CSV log: a header of `name` or `name [unit]`, then one line of numbers per row.
 
     Accepted forms:
-    - Columns are separated by comma, semicolon or tab: the most frequent in the header, or that of a
-      first line `sep=;`. Separators at the end of a line and lines of separators only are ignored.
+    - Columns are separated by comma, semicolon or tab. It is the most frequent of these in the
+      header, or the one that a first line such as `sep=;` states. Separators at the end of a line,
+      and lines of separators only, are ignored.
     - Numbers have a decimal point or a decimal comma, the same in the whole file. With commas
       between the columns, numbers with a decimal comma must be in quotation marks.
     - Lines that begin with `#`, `%`, `//` or `;` are comments; `# key: value` is read as metadata.
-    - A column of ISO dates, or of times such as `12:30:05.020`, is read as seconds since its first.
+    - A column of ISO dates, or of times such as `12:30:05.020`, is read as seconds since its first
+    row.
 
     Args:
         path: the file.
         missing: read empty cells as NaN, and report columns that contain other things than numbers
-            as `faults`, instead of refusing both.
+            as `faults` of the table. If False, both raise an InputError.
 
     Raises:
         InputError: the file is not UTF-8 text, is empty, has no header, has a row of the wrong
@@ -156,7 +158,7 @@ def read_csv(path: Path, missing: bool = False) -> Table:
 def _iterate_lines(path: Path, max_line: int) -> Iterator[tuple[int, str]]:
     """Yield (line number from 1, line) of a UTF-8 text file without holding all lines in memory.
 
-    A longer line is yielded in parts of `max_line` characters.
+    A line of more than `max_line` characters is yielded in parts of this length.
     """
     with open_regular(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig")
@@ -187,7 +189,11 @@ class _CsvReader:
         self._comma_is_certain = False  # whether a comma cannot separate thousands
 
     def parse_line(self, number: int, line: str) -> None:
-        """Parse the next line of the file, including its line break."""
+        """Parse the next line of the file and store its header, metadata or numbers.
+
+        `number` is the line number from 1; `line` includes the line break. Raises InputError for a
+        row of the wrong length or a line that is too long.
+        """
         if len(line) == self.max_line:
             self._check_columns(line)
             message = (
@@ -206,10 +212,11 @@ class _CsvReader:
             self._parse_row(number, line)
 
     def to_table(self) -> Table:
-        """Return the table of all lines.
+        """Return the table of all parsed lines.
 
         Raises:
-            InputError: there is no header, or the decimal sign is not the same everywhere.
+            InputError: there is no header, the decimal sign is not the same everywhere, or commas
+                could be decimal signs or separate thousands.
         """
         if self._possible_header is not None:
             self._parse_comment(self._possible_header)
@@ -258,7 +265,7 @@ class _CsvReader:
             self._parse_header(line)
 
     def _is_row_below(self, header: str, line: str) -> bool:
-        """Return whether a line is a row of numbers with as many cells as a possible header above it."""
+        """Return whether a line is a row of numbers or empty cells, with as many cells (at least 2) as the header."""
         separator = self.separator or _find_separator(header)
         cells = _split_line(line, separator)
         return len(cells) == len(_split_line(header, separator)) > 1 and all(
@@ -317,6 +324,7 @@ class _CsvReader:
         """Return the number in a cell; a date becomes seconds since the first date of the column.
 
         An empty cell and a cell of other text give NaN; the latter also gives the column a fault.
+        If `missing` is False, both raise an InputError instead.
 
         Args:
             place: index of the column.
@@ -438,7 +446,10 @@ def _unreadable_parquet_error(path: Path, error: Exception) -> InputError:
 
 
 def _find_converter(spec) -> Callable | None:
-    """Return the function that converts a Parquet column to float64, None if it has no numbers."""
+    """Return the function that converts a Parquet column to float64; None if it has neither numbers nor dates.
+
+    Booleans count as numbers only in the columns `valid` and `mask`.
+    """
     import pyarrow as pa
 
     if pa.types.is_timestamp(spec.type):

@@ -23,21 +23,22 @@ _MAX_DISCARDED_FRACTION = 0.5  # of the readings: more rows per stamp mean that 
 def repair_time_stamps(table: Table, minimum_rows: int) -> tuple[Table, float, tuple[str, ...]]:
     """Return a table with increasing time stamps.
 
-    Rows out of order are sorted, unless a clock that was set back is the more likely cause. Rows with
-    the same stamp become one row with the last value of each column. Where the clock was set back, or
-    forward by more than 11 days, a pause of at least 2 s is inserted: the later rows are shifted in
-    time. Stamps of calendar time are counted from the first row.
+    Rows out of order are sorted, unless a clock that was set back is the more likely cause. Rows
+    with the same stamp become one row with the last value of each column. Where the clock was set
+    back, or forward by more than 11 days, a pause of at least 2 s is inserted: the later rows are
+    shifted in time. If the first stamp is beyond 1e6 s (11 days), it is calendar time, and time is
+    counted from it.
 
     Args:
         table: table in SI units with the column `time`, finite.
-        minimum_rows: minimum number of rows between two jumps of the clock.
+        minimum_rows: number of rows that the longest part between two jumps of the clock must have.
 
     Returns:
         (table, original stamp that corresponds to time 0 [s], notes).
 
     Raises:
-        InputError: the stamps are too coarse for the rows or not in seconds, or the clock is set back
-            too often.
+        InputError: the stamps are too coarse for the rows or not in seconds, or the clock is set
+            back too often.
     """
     table, notes = _sort_rows(table)
     table, note = _merge_equal_stamps(table)
@@ -67,10 +68,10 @@ def _select_rows(table: Table, rows: np.ndarray) -> Table:
 
 
 def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
-    """Return the table sorted by time, and notes.
+    """Return the table with its rows sorted by time, and notes.
 
-    It is not sorted if the sorted rows would be irregular. The clock was then set back, and sorting would
-    mix rows of different moments.
+    The rows are not sorted if their time steps would be irregular. The clock was then set back, and
+    sorting would mix rows of different moments.
     """
     time = _time_column(table)
     step = np.diff(time)
@@ -89,9 +90,11 @@ def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
 
 
 def _merge_equal_stamps(table: Table) -> tuple[Table, tuple[str, ...]]:
-    """Return the table with one row for consecutive rows of the same time stamp, and notes.
+    """Return the table with consecutive rows of the same time stamp merged to one row, and notes.
 
-    The row has the last number of each column; its `valid` is 0 if that of any merged row is.
+    A merged row has the last number of each column; its `valid` is 0 if that of any merged row is.
+
+    Raises InputError if more than half of the readings would be lost.
     """
     time = _time_column(table)
     repeats = np.diff(time) == 0.0
@@ -126,7 +129,7 @@ def _merge_equal_stamps(table: Table) -> tuple[Table, tuple[str, ...]]:
 
 
 def _check_step(table: Table) -> None:
-    """Check that the median time step is below 1 s; otherwise the stamps are probably not in seconds."""
+    """Raise InputError if the median time step is at least 1 s, because the stamps are then probably not in seconds."""
     step = np.diff(_time_column(table))
     period = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
     if period >= _MAX_STEP:
@@ -137,8 +140,13 @@ def _check_step(table: Table) -> None:
 def _insert_pause_at_clock_jumps(table: Table, minimum_rows: int) -> tuple[Table, tuple[str, ...]]:
     """Shift the rows after each jump of the clock in time, so that a pause of at least 2 s precedes them.
 
+    A jump is a step back, or forward by more than 11 days.
+
     Returns:
         (table, notes).
+
+    Raises:
+        InputError: no part between jumps has `minimum_rows` rows.
     """
     time = _time_column(table)
     step = np.diff(time)

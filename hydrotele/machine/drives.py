@@ -22,10 +22,13 @@ class Pin(StrictModel):
 class Friction(StrictModel):
     """Friction parameters of a drive: forces [N] or [N m], velocities [m/s] or [rad/s].
 
-    An asymmetry a multiplies the dry or the viscous friction by 1 + a in the positive direction
-    and by 1 - a in the negative one. With a `presliding_stiffness` [N/m] or [N m/rad], dry friction
-    is a spring below breakaway (`hydraulics.presliding`) with a damper `presliding_damping`
-    [N s/m] or [N m s/rad]; `smoothing_velocity` is then not used.
+    Dry friction is `coulomb` plus `stribeck_extra` at rest; the latter decays with the velocity
+    (`stribeck_velocity`). `viscous` [N s/m] or [N m s/rad] is proportional to the velocity.
+    `smoothing_velocity` smooths the sign of dry friction. An asymmetry a multiplies the dry or the
+    viscous friction by 1 + a in the positive direction and by 1 - a in the negative one. With a
+    `presliding_stiffness` [N/m] or [N m/rad], dry friction is a spring below breakaway
+    (`hydraulics.actuator`) with a damper `presliding_damping` [N s/m] or [N m s/rad]; dry friction
+    then has no smoothed sign.
     """
 
     coulomb: NonNegativeFloat = 0.0
@@ -51,7 +54,11 @@ class Friction(StrictModel):
 
 
 class CylinderPart(StrictModel):
-    """Tube or rod of a cylinder: mass [kg], com distance from its pin [m], inertia [kg m^2]."""
+    """Tube or rod of a cylinder: mass [kg], distance `com` of its centre of mass from its pin [m].
+
+    The pin is the base pin for a tube and the rod pin for a rod. `inertia` [kg m^2] are the
+    principal moments about the centre of mass; the first is about the cylinder's axis.
+    """
 
     mass: PositiveFloat
     com: float
@@ -61,7 +68,9 @@ class CylinderPart(StrictModel):
 class Cylinder(StrictModel):
     """A hydraulic cylinder between two pins.
 
-    The piston displacement is x = pin-to-pin length - closed_length, 0 .. stroke.
+    The piston displacement is x = pin-to-pin length - closed_length, 0 .. stroke [m]. The areas
+    [m^2] are those of the piston on both sides. `dead_volume` [m^3] is the volume of each chamber
+    with the piston at its end, and `leakage` [m^3/(s Pa)] the laminar leakage past the piston.
     `hose_compliance` [m^3/Pa] is the volume increase of the hose of each chamber with pressure.
     """
 
@@ -104,7 +113,11 @@ class Cylinder(StrictModel):
 
 
 class Motor(StrictModel):
-    """A hydraulic motor on a joint: displacement [m^3/rad], constant chamber volumes [m^3]."""
+    """A hydraulic motor on a joint: displacement [m^3/rad], constant volume of each chamber [m^3].
+
+    `leakage` [m^3/(s Pa)] is the laminar leakage between the ports, and `hose_compliance` [m^3/Pa]
+    that of the hose of each port.
+    """
 
     displacement: PositiveFloat
     dead_volume: PositiveFloat
@@ -124,7 +137,10 @@ class Motor(StrictModel):
 
 
 class ForceDrive(StrictModel):
-    """A force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
+    """A drive whose force or torque on the load is `gain * command - friction - offset` [N] or [N m].
+
+    `command_limit` is the largest magnitude of the command [command_unit].
+    """
 
     gain: float
     command_unit: Literal["1", "V", "N"] = "1"
@@ -163,7 +179,7 @@ class FlowCurve(StrictModel):
 
 
 class Metering(StrictModel):
-    """One direction of spool travel: dead band, gains of the two metering edges, flow curve.
+    """One direction of spool travel: dead band [1], gains of the two metering edges, flow curve.
 
     `inlet` and `outlet` [1] scale the flow gain from the pump into one chamber (P-A or P-B) and
     from the other chamber to tank (B-T or A-T). The default dead band is that of the valve.
@@ -183,7 +199,10 @@ class Valve(StrictModel):
     is then independent of the load, as long as the supply pressure suffices. `tank_leakage`
     [m^3/(s Pa)] is the laminar leakage from each work port to tank, through the radial clearance of
     the spool (`hydraulics.valve.chamber_flows`). `positive` and `negative` describe the two
-    directions of travel; a positive command feeds the head side.
+    directions of travel; a positive command feeds the head side. `deadband` [1] applies to
+    directions without their own. `port_relief` [Pa] is the setting of the relief valve at each work
+    port. It and the make-up valve from tank pass `port_relief_gain` and `makeup_gain` [m^3/(s Pa)].
+    Below the pressure drop `smoothing` [Pa] the root law of the orifices is smoothed.
     """
 
     rated_flow: PositiveFloat
@@ -349,7 +368,11 @@ class EndStop(StrictModel):
 
 
 class FourBar(StrictModel):
-    """Names of the links between cylinder and joint of a four-bar linkage."""
+    """Names of the links through which a cylinder moves the driven link: rocker and coupler.
+
+    The cylinder's rod, the rocker and the coupler meet in one pin. A closure of the machine joins
+    the coupler to the driven link.
+    """
 
     rocker: Name
     coupler: Name
@@ -443,14 +466,14 @@ class Axis(StrictModel):
 
     @property
     def rated_flow(self) -> float:
-        """Flow of the valve at its rated drop, or of the individual pump [m^3/s]."""
+        """Flow of the valve at its rated drop, or of the individual pump at its rated speed [m^3/s]."""
         source = self.valve or self.pump
         assert source is not None
         return source.rated_flow
 
     @property
     def hydraulic_drive(self) -> Cylinder | Motor:
-        """Cylinder or motor of a hydraulic axis."""
+        """Cylinder or motor of the axis, which must be hydraulic."""
         drive = self.cylinder or self.motor
         assert drive is not None
         return drive

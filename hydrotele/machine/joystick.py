@@ -29,7 +29,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Workspace(StrictModel):
-    """Travel of the coil centre in the gap, each direction [m], and rotation of the flotor [rad].
+    """Largest travel of the coil centre from the middle of the gap [m] and rotation of the flotor [rad].
 
     A rotation about the handle is smaller, because the handle is off the coils; see
     `Joystick.handle_travel`.
@@ -47,7 +47,11 @@ class OpticalSensing(StrictModel):
 
 
 class Flotor(StrictModel):
-    """The flotor in the coil frame: mass [kg], com [m], inertia [kg m^2], handle position [m]."""
+    """The flotor (levitated part with handle and coils), in the coil frame.
+
+    `mass` [kg], centre of mass `com` [m], principal moments of `inertia` about it [kg m^2],
+    position of the `handle` [m].
+    """
 
     mass: PositiveFloat
     com: Vector
@@ -79,7 +83,10 @@ class Diodes(StrictModel):
 
 
 class UnheldDynamics(StrictModel):
-    """Closed-loop frequency [rad/s] and damping ratio [1] of x, y, z, rx, ry, rz without a hand."""
+    """Target closed-loop dynamics of the levitated handle without a hand, for x, y, z, rx, ry, rz.
+
+    `frequency` [rad/s] is the natural frequency and `ratio` [1] the damping ratio.
+    """
 
     frequency: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
     ratio: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
@@ -137,7 +144,10 @@ class HandImpedance(StrictModel):
 
 
 class PrincipalValues(NamedTuple):
-    """Principal values of a symmetric 2 x 2 matrix; angle of its major axis from x [rad]."""
+    """Principal values of a symmetric 2 x 2 matrix, and angle of its major axis from x [rad].
+
+    The major axis belongs to `max_value`.
+    """
 
     min_value: float
     max_value: float
@@ -162,7 +172,11 @@ def find_principal_values(shape: SymmetricMatrix) -> PrincipalValues:
 
 
 class Detent(StrictModel):
-    """Perceptible edge of the dead band: force drop [N] or [N m], stiffness outside [N/m] or [N m/rad]."""
+    """Perceptible edge of a joystick axis' dead band.
+
+    At the edge, the spring force decreases by `drop` [N] or [N m]. Outside, the stiffness is
+    `slope` [N/m] or [N m/rad].
+    """
 
     renamed = {"outside": "slope"}
 
@@ -171,10 +185,13 @@ class Detent(StrictModel):
 
 
 class AxisGains(StrictModel):
-    """Stiffness feedback of one joystick axis, [N, m] or [N m, rad].
+    """Stiffness feedback of one joystick axis.
 
-    `force_limit` [N] or [N m] is the machine force at which the stiffness reaches
-    `max_stiffness`.
+    The units below are those of translations; rotations have N m and rad. The spring stiffness
+    towards the centre is `nominal_stiffness` without force of the machine, and always between
+    `min_stiffness` and `max_stiffness` [N/m]. `force_limit` [N] is the force of the machine at
+    which the stiffness reaches `max_stiffness`. `damping` [N s/m] acts in parallel. Under rate
+    control, the machine does not move while the handle is within `deadband` [m] of the centre.
     """
 
     renamed = {"nominal": "nominal_stiffness", "least": "min_stiffness", "most": "max_stiffness"}
@@ -203,7 +220,11 @@ class AxisGains(StrictModel):
 
 
 class Joystick(StrictModel):
-    """A six-DOF levitated joystick; `mount` [m] is its position in the cab, `control_rate` [Hz]."""
+    """A six-DOF levitated joystick; `mount` [m] is its position in the cab, `control_rate` [Hz].
+
+    `gains` maps the name of a set of gains to those of every axis x, y, z, rx, ry, rz.
+    `closed_loop` is the dynamics of the handle without a hand.
+    """
 
     renamed = {"alone": "closed_loop"}
 
@@ -225,10 +246,10 @@ class Joystick(StrictModel):
 
     @property
     def handle_travel(self) -> tuple[float, ...]:
-        """Travel of the handle along and about each axis separately, (6,) [m], [rad].
+        """Largest displacement [m] or rotation [rad] of the handle for each axis separately, (6,).
 
         A rotation about the centre of the handle also moves the coils, which are at a distance from
-        it. The rotation is limited by the gap of the coils.
+        the handle. The rotation is limited by the gap of the coils and by `workspace.rotation`.
         """
         far, most, handle = self.workspace.translation, self.workspace.rotation, self.flotor.handle
         turns = []

@@ -32,7 +32,7 @@ class ChannelKind(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """A parsed channel name; `axis` is "" for a bare channel."""
+    """A parsed channel name: `truth` is whether it starts with `truth.`, `axis` is "" without an axis."""
 
     kind: str
     axis: str
@@ -95,7 +95,7 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
 
 
 class MagnitudeLimits(NamedTuple):
-    """Plausible range of the maximum magnitude of a channel in a run, and the likely wrong unit."""
+    """Plausible range of a channel's maximum magnitude in a run, and the likely unit of values outside."""
 
     min_magnitude: float
     max_magnitude: float
@@ -121,7 +121,8 @@ _COMMAND_LIMITS = MagnitudeLimits(0.0, 1.0 + 1e-3, "percent, counts or volts")
 def plausible_magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeLimits:
     """Return the plausible range of a channel's maximum magnitude in a run [unit], to detect a wrong unit.
 
-    The range is wider if the file states the unit (`stated`).
+    The range is wider if the file states the unit (`stated`). It is unlimited for pump speeds and
+    for units without a typical confusion.
 
     >>> plausible_magnitude_limits("angle.boom", "rad").looks_like
     'degrees'
@@ -193,10 +194,10 @@ def allowed_channel_units(name: str) -> tuple[str, ...]:
 
 
 def default_channel_unit(name: str, present: Iterable[str] = ()) -> str:
-    """Return the default unit of a channel for files that state none.
+    """Return the default SI unit of a channel for files that state none.
 
-    If a kind can be rotary or linear, the linear unit is used if the log has a `position` channel
-    of the same axis.
+    If a kind can be rotary or linear, the unit is linear if `present`, the channel names of the
+    log, contains a `position` channel of the same axis; otherwise it is rotary.
 
     >>> default_channel_unit("reference.slide", present=["position.slide"])
     'm'
@@ -213,7 +214,7 @@ def default_channel_unit(name: str, present: Iterable[str] = ()) -> str:
 def suggest_channel_names(name: str, present: Iterable[str] = ()) -> list[str]:
     """Return up to three valid channel names similar to `name`, most similar first.
 
-    `present` adds names that occur in the data.
+    `present` are further names, such as those in the data, which may be suggested.
 
     >>> suggest_channel_names("angel.boom")[0]
     'angle.boom'

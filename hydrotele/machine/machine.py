@@ -152,7 +152,7 @@ class Supply(StrictModel):
 
 
 class Arm(StrictModel):
-    """Joint names of a swing-boom-stick(-tool(-head)) arm, and its tip.
+    """Names of the joints of an arm from swing over boom and stick to tool and head, and its tip.
 
     `tool` rotates in the plane of the arm, like a bucket or the tilt of a feller-buncher. `head`
     rotates on the tool about an axis in the plane of the arm, perpendicular to the tool.
@@ -173,10 +173,14 @@ class Arm(StrictModel):
 
 
 class Machine(StrictModel):
-    """Complete description of a machine for simulation, control and identification.
+    """Complete description of a machine with one tool, for simulation, control and identification.
 
-    `sensed_joints` are the joints with the angle sensors of a calibrator, starting at the machine.
-    `attached` maps the name of a body of `mjcf` to an MJCF file whose bodies are attached to it.
+    `mjcf` and `attached` files are relative to `folder`. `attached` maps the name of a body of
+    `mjcf` to an MJCF file whose bodies are attached to it; `removed_bodies` are the bodies of
+    unused tools. `sensed_joints` are the joints with the angle sensors of a calibrator, starting at
+    the machine. `home` are the joint positions at home [rad] or [m]. `loads` are the load cylinders
+    of pump axes. `log_columns` maps columns of log files to channels. `uncertainty` are standard
+    deviations of parameters by name. `terms` are additional force, flow and command laws.
     """
 
     name: Name
@@ -242,7 +246,11 @@ class Machine(StrictModel):
         return {name: axis for name, axis in self.axes.items() if axis.valve}
 
     def max_feed_pressure(self, axis: str) -> float:
-        """Return the maximum feed pressure of an axis [Pa]: of the common supply, or stall pressure of its pump."""
+        """Return the maximum feed pressure of a hydraulic axis [Pa].
+
+        It is the maximum pressure of the common supply, or the stall pressure of the axis' own
+        pump.
+        """
         pump = self.axes[axis].pump
         if pump:
             return pump.stall_pressure
@@ -250,7 +258,11 @@ class Machine(StrictModel):
         return self.supply.max_pressure
 
     def return_pressure(self, axis: str) -> float:
-        """Return the return pressure of a hydraulic axis [Pa]: tank or accumulator of its pump."""
+        """Return the pressure to which a hydraulic axis drains [Pa].
+
+        It is the tank pressure of the common supply, or the accumulator pressure of the axis' own
+        pump.
+        """
         pump = self.axes[axis].pump
         if pump:
             return pump.accumulator.pressure
@@ -268,10 +280,11 @@ class Machine(StrictModel):
     def end_stop(self, axis: str) -> EndStop | None:
         """Return the end stop of an axis, or None if its travel is unlimited.
 
-        A force drive without gain has only the end stop of the machine file, if any.
-
-        If the machine file has none, it is estimated. Its stiffness is the largest drive force divided by
-        1 mm or 2 mrad: the typical deformation of tube, gland and pins of a heavy cylinder at that force.
+        Without a cylinder and a joint range the travel is unlimited. An end stop of the machine
+        file is returned as it is; otherwise it is estimated. The estimated stiffness is the largest
+        drive force divided by 1 mm or 2 mrad, the typical deformation of tube, gland and pins of a
+        heavy cylinder at that force. The estimated damping is 5 ms times the stiffness. For a force
+        drive with gain 0 nothing is estimated.
         """
         facts = self.axes[axis]
         joint = self.joints[facts.joint]
@@ -296,7 +309,7 @@ class Machine(StrictModel):
 
     @property
     def sensed_channels(self) -> tuple[str, ...]:
-        """Channels that sensors of this machine can measure."""
+        """Names of the position, length and pressure channels that sensors of this machine can measure."""
         names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
         names += [f"angle.{joint}" for joint in self.undriven_sensed_joints]
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
@@ -470,9 +483,10 @@ def get_sensor_set(machine: Machine, name: str) -> SensorSet | None:
 
 
 def find_channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
-    """Return the sensor of a channel, an ideal one if `sensors` is None.
+    """Return the sensor that measures a channel according to a sensor set; an ideal sensor for None.
 
-    The default span of a length sensor is the cylinder's stroke.
+    The channel's own entry in the set replaces the sensor of its kind. The default span of a length
+    sensor with a converter is the cylinder's stroke.
     """
     if sensors is None:
         return Sensor()
@@ -487,6 +501,6 @@ def find_channel_sensor(machine: Machine, sensors: SensorSet | None, channel: st
 
 
 def reading_noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
-    """Return the standard deviation of one reading [channel's unit]: random error plus rounding."""
+    """Return the standard deviation of a reading [channel's unit]: random error and rounding."""
     sensor = find_channel_sensor(machine, sensors, channel)
     return math.sqrt(sensor.error_rms**2 + make_channel_converter(sensor, channel).step ** 2 / 12.0)

@@ -73,7 +73,10 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     Raises:
         InputError: the file is invalid; the message gives file, line, key and valid values.
     """
-    path = find_machine_file(name_or_path)
+    return _read_machine(find_machine_file(name_or_path), tool)
+
+
+def _read_machine(path: Path, tool: str | None) -> Machine:
     data, lines = read_yaml(path)
     others: list[dict] = []
     if "extends" in data:
@@ -134,7 +137,11 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
 
 def _copy_law_files(machine: Machine, folder: Path) -> Machine:
-    """Copy user files that define laws of terms into a folder; return the machine with the names of the copies."""
+    """Copy the user files that define laws of terms into a folder.
+
+    Return the machine with the names of the copies as sources of its terms. Raise InputError if two
+    different files have the same name.
+    """
     terms, copied = [], {}
     for term in machine.terms:
         source = LAWS[term.law].source
@@ -150,7 +157,10 @@ def _copy_law_files(machine: Machine, folder: Path) -> Machine:
 
 
 def _merge_extended_machine(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
-    """Merge a machine file with the machine that it extends.
+    """Merge the data of a machine file with those of the machine that it extends (key `extends`).
+
+    `lines` maps key paths to line numbers, for messages. Raise InputError if the other machine or
+    its tool does not exist, or if it extends a machine itself.
 
     Returns:
         The complete data, and the sections of the unused tools of the other machine.
@@ -187,7 +197,10 @@ def _merge_sections(base, new):
 
 
 def _format_location(path: Path, lines, *keys: str) -> str:
-    """Return file, line and key path as text for messages."""
+    """Return file, line and key path as text for messages.
+
+    The line is that of the longest leading part of the key path that `lines` contains.
+    """
     line = next((lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in lines), 0)
     return f"{path}{f':{line}' if line else ''}: {'.'.join(keys)}"
 
@@ -202,7 +215,11 @@ def _check_tools(tools, path: Path, lines) -> None:
 
 
 def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dict:
-    """Add the sections of a tool to those of the machine; return the line numbers of the result."""
+    """Add the sections `fragment` of a tool to the machine data `data`, in place.
+
+    Raise InputError if a link, axis or closure of the tool already exists. Return `lines`, the line
+    number of every key path, with the lines of the added keys.
+    """
     for section, entries in fragment.items():
         old, new = ("tools", tool, str(section)), (str(section),)
         lines = lines | {new + p[len(old) :]: n for p, n in lines.items() if p[: len(old)] == old}
@@ -235,7 +252,11 @@ def _mjcf_body_names(fragments) -> tuple[str, ...]:
 
 
 def _complete_links_from_mjcf(data: dict, path: Path, lines) -> None:
-    """Add link data from the MJCF file; a value that both files contain is an error."""
+    """Add link data from the MJCF file to the machine data, in place.
+
+    A value that both files contain raises InputError. Data that `save_machine` wrote (`resolved`)
+    are already complete and are not changed.
+    """
     if data.pop("resolved", False):
         return
     if not data.get("mjcf"):
@@ -255,7 +276,10 @@ def _complete_links_from_mjcf(data: dict, path: Path, lines) -> None:
 
 
 def _merge_link(link: dict, known: dict, where: str, mjcf: str) -> dict:
-    """Merge the YAML and MJCF data of a link; a value may be in one of them only."""
+    """Return the merged YAML data `link` and MJCF data `known` of a link.
+
+    Raise InputError for a value that is in both.
+    """
     joint, known_joint = link.get("joint"), known.get("joint")
     twice = {key for key in link if split_unit(str(key))[0] in known} - {"joint"}
     if isinstance(joint, dict) and known_joint:
@@ -269,7 +293,11 @@ def _merge_link(link: dict, known: dict, where: str, mjcf: str) -> dict:
 
 
 def _read_mjcf_body(body, degrees: bool, where: str) -> dict:
-    """Return parent, position, inertia and joint of an MJCF body, with default classes applied."""
+    """Return the link data of an MJCF body: parent, position, inertia and joint.
+
+    Default classes are applied. Raise InputError if the inertia is not diagonal in the body's axes,
+    or for more than one joint.
+    """
     facts: dict = {"parent": body.parent.name}
     if np.any(body.pos):
         facts["position"] = body.pos.tolist()
@@ -294,7 +322,11 @@ def _read_mjcf_body(body, degrees: bool, where: str) -> dict:
 
 
 def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
-    """Convert pins in polar coordinates to points, and motor torque per psi to displacement."""
+    """Convert drive parameters in other forms to those of `Axis`, in place.
+
+    Pins in polar coordinates become points. `torque_per_psi` [N m/psi] times `gear_ratio` of a
+    motor becomes its displacement [m^3/rad].
+    """
     for name, axis in _section_entries(data, "axes").items():
         if not isinstance(axis, dict):
             continue
@@ -312,10 +344,10 @@ def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
 
 
 def _convert_polar_pin(pin: dict, data: dict, where: str) -> dict:
-    """Return a pin with its position computed from `distance` and `angle_deg` in the x-z plane.
+    """Return a pin with its position computed from polar coordinates in the x-z plane.
 
-    They start at the joint of the link `from`, or at the frame's origin. A pin without `distance` is
-    returned unchanged.
+    `distance` and `angle_deg` of the pin are measured from the position of the link `from`, or
+    without `from` from the origin of the frame. A pin without `distance` is returned unchanged.
     """
     if "distance" not in pin:
         return pin

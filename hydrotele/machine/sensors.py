@@ -72,10 +72,10 @@ class SensorError(StrictModel):
     """Systematic error of one channel: the reading is `scale * y(t - delay) + offset`, delay [s].
 
     y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
-    a time constant it is the true value. The coupling of the sensor of an undriven joint may be
+    a time constant y is the true value. The coupling of the sensor of an undriven joint may be
     misaligned by `tilt` [rad], like a universal joint, `tan(reading) = tan(y) cos(tilt)`, and have
-    a `backlash` [rad]. While the sensor warms up from the start of the run, its offset changes by
-    `drift` with the time constant `drift_time_constant` [s] (`warming_drift`).
+    a `backlash` [rad], its total width. While the sensor warms up from the start of the run, its
+    offset changes by `drift` with the time constant `drift_time_constant` [s] (`warming_drift`).
     """
 
     offset: float = 0.0
@@ -116,7 +116,11 @@ class Converter(NamedTuple):
 
 
 def make_channel_converter(sensor: Sensor, channel: str) -> Converter:
-    """Return the analogue-to-digital converter of a channel; lengths and pressures are limited to 0 .. span."""
+    """Return the analogue-to-digital converter of a channel that a sensor measures.
+
+    Its step is span / 2^bits; a sensor without bits or span is not rounded. Lengths and pressures
+    are limited to 0 .. span, angles and positions are not limited.
+    """
     if sensor.bits is None or sensor.span is None:
         return Converter(0.0, -math.inf, math.inf)
     step = sensor.span / 2.0**sensor.bits
@@ -127,12 +131,12 @@ def make_channel_converter(sensor: Sensor, channel: str) -> Converter:
 
 @compiled
 def warming_drift(time, drift, time_constant):
-    """Return the offset change of a sensor since it was switched on.
+    """Return the change of a sensor's offset at a time after it was switched on.
 
     `e (1 - exp(-t / T))`: the offset is proportional to the temperature of a single heat capacity.
 
     Args:
-        time: t, scalar or array [s].
+        time: t since the sensor was switched on, scalar or array [s].
         drift: e, final change of the warm sensor, scalar [channel's unit].
         time_constant: T, scalar, positive [s].
 

@@ -101,7 +101,7 @@ class Chain:
     source: str = ""
 
     def index(self, joint: str) -> int:
-        """Return the index of a joint, given by its name, among all joints of the chain.
+        """Return the index of the joint with a given name among all joints of the chain.
 
         Raises:
             InputError: the joint does not exist.
@@ -112,7 +112,7 @@ class Chain:
 
 
 class _Joint(NamedTuple):
-    """A hinge or a slide of the tree."""
+    """A hinge or a slide of the tree; units and meaning as in `Tree` and `Chain`."""
 
     name: str
     body: int
@@ -134,7 +134,8 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
     """Read a mechanism from an MJCF file or a compiled model.
 
     A kinematic tree without actuator and closure, such as an object on the ground next to a
-    machine, is treated as fixed and has no joints. If no tree has any, all joints are kept.
+    machine, is treated as fixed: its joints are removed. If no tree has an actuator or a closure,
+    all joints are kept.
 
     Args:
         source: path of an MJCF file, or a compiled model.

@@ -37,9 +37,10 @@ def find_start_pose(
 ) -> np.ndarray:
     """Return a pose with closed loops from which the motion of the given joints can be followed.
 
-    This is the start pose, with its loops closed by moving all joints. If they do not close there, or if
-    the pose is singular, it is the pose that closes the loops at the first row. Only one such pose
-    (assembly) may then exist.
+    The function first closes the loops from the start pose by moving all joints, and returns that
+    pose. If the loops do not close, or the given joints and the closures do not determine all other
+    joints there, it searches for poses (assemblies) that close the loops at the first row of
+    `position`. Exactly one of these may determine all joints; it is returned.
 
     Args:
         chain: the chain.
@@ -49,7 +50,7 @@ def find_start_pose(
         seed: seed of the search for all assemblies.
 
     Returns:
-        (v,) [rad] or [m].
+        (v,) positions of all joints [rad] or [m].
 
     Raises:
         InputError: the loops cannot be closed at the first row or in several ways, or the closures
@@ -84,10 +85,11 @@ def describe_unclosed_loop(chain: Chain, given: Sequence[str], position: np.ndar
         chain: the chain.
         given: the k joints with known positions.
         position: (k,) their positions [rad] or [m].
-        row: number of the row.
+        row: index of the row of the log, for the message.
 
     Returns:
-        The closure with the largest opening, the opening in mm, and what to do.
+        The message: the row, the closure with the largest opening at the best approximation, the
+        opening in mm, and what to do.
     """
     columns = np.array([chain.index(name) for name in given], np.int64)
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
@@ -230,7 +232,8 @@ def find_assemblies(
         chain: the chain.
         given: the k joints with known positions.
         position: (k,) their positions [rad] or [m].
-        body: body whose pose distinguishes assemblies; all bodies by default.
+        body: only assemblies in which this body has different poses are listed separately; by
+            default any body counts.
         starts: number of random start positions.
         seed: seed of the start positions.
 
@@ -265,7 +268,10 @@ def find_assemblies(
 
 
 def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
-    """Return the position and the rotation matrix of one body, or of all bodies if None, as one vector."""
+    """Return position [m] and rotation matrix of a body at joint positions q, flattened to one vector.
+
+    If `body` is None, the vector contains all bodies.
+    """
     frames, still = allocate_frames(chain.tree), np.zeros(len(q))
     compute_frames(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1

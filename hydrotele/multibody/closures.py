@@ -127,9 +127,10 @@ class LoopWorkspace(NamedTuple):
         frames: frames of the bodies.
         error: (r, 1) residuals of the loop equations [m], [rad].
         error_jacobian: (r, v) d error / d joint positions.
-        q_factor: (r, m) orthonormal factor of the columns of `error_jacobian` of the unknown joints.
+        q_factor: (r, m) orthonormal factor of the columns of `error_jacobian` of the unknown
+            joints.
         r_factor: (m, m) triangular factor.
-        solution: (m, k) solutions, k at least 1.
+        solution: (m, k) solutions of the linear systems for k right-hand sides, k at least 1.
     """
 
     zero_rates: np.ndarray
@@ -229,7 +230,7 @@ def evaluate_loop_residuals(tree, q):
 
 
 def precompile_loop_residuals() -> None:
-    """Compile, before they are needed, the functions that compute loop residuals, with a pendulum as input."""
+    """Compile the functions that compute loop residuals before they are needed, by one call for a pendulum."""
     body = '<body><joint name="hinge"/><geom size="1"/></body>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     tree = load_chain(model).tree

@@ -68,12 +68,12 @@ def project_on_drives(
         acceleration: (n, k) their accelerations [rad/s^2] or [m/s^2].
         drives: k joints whose forces are computed; the drives of the chain by default.
         start: (v,) initial positions before the first row; those of the chain by default.
-        moment_free: body -> unit axis through the origin of its frame, in that frame, about which
-            its neighbours transmit no moment. Its motion is not affected.
+        moment_free: body -> unit axis through the origin of the body's frame, in that frame. The
+            neighbours transmit no moment to the body about this axis. The motion is not affected.
 
     Returns:
-        The projection. The drive forces are `body_projection @ chain.inertia.ravel()` plus the friction
-        forces.
+        The projection. The forces that the drives must exert are `body_projection @
+        chain.inertia.ravel()` (inertia and gravity) plus friction.
 
     Raises:
         InputError: a shape is wrong, a value is missing, a body does not exist, the closures do not
@@ -119,7 +119,7 @@ def project_on_drives(
 
 
 def find_body_index(chain: Chain, body: str) -> int:
-    """Return the index of a body in a chain, or raise InputError."""
+    """Return the index of a body among the bodies of a chain without the world; raise InputError if it has none."""
     if body not in chain.bodies:
         raise InputError(_ERROR_CONTEXT, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}")
     return chain.bodies.index(body)
@@ -245,7 +245,8 @@ def _project_wrench(tree, frames, body, forces, torques, joint_projection, out):
         forces: (3, 10) force per unit of each inertial parameter, see `compute_unit_wrenches`.
         torques: (3, 10) torque, likewise.
         joint_projection: (k, v) force of drive k per unit force or torque in joint v.
-        out: (k, 10 b) written in the columns of this body: drive forces.
+        out: (k, 10 b) forces of the drives per unit of each inertial parameter; the ten columns of
+            this body are written.
     """
     first, point = 10 * (body - 1), get_vector(frames.origin, body)
     for i in range(len(joint_projection)):

@@ -75,15 +75,17 @@ def solve_cholesky(factor, right):
 def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
     """Compute the frames and Jacobians of all cylinders (bars between two pins).
 
-    The x axis of tube and rod points along the bar, and the y axis along the pins.
+    Tube and rod of a bar have the same orientation: the x axis points from base pin to rod pin, and
+    the y axis is opposite to the pin axis (AXIS of `shape`). Their origins are at their pins.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
         shape: (f, SHAPE_SIZE) geometry of the frames, see `ReducedMechanism`.
         first: index of the first tube.
         frame: (f, FRAME_SIZE) orientation and origin of the frames, written; see `ReducedMotion`.
-        jacobian: (f, N, 6) their velocities per joint rate, written.
-        bar: (bars, 3 + N) lengths and their Jacobian, written.
+        jacobian: (f, N, 6) velocity and spin of tubes and rods per joint rate, written.
+        bar: (bars, 3 + N) columns LENGTH (pin to pin) and, from LENGTH_ROW on, its Jacobian;
+            written.
 
     Returns:
         Nothing.
@@ -128,13 +130,15 @@ def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
 def compute_bar_motion(tree, first, frame, bar):
     """Compute the motion of all cylinders (bars): spin, accelerations, and rate of their length.
 
-    The accelerations are those at zero joint acceleration. `compute_bar_frames` comes first.
+    The accelerations are those at zero joint acceleration. `compute_bar_frames` must be called
+    first.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
         first: index of the first tube.
         frame: (f, FRAME_SIZE) motion of tubes and rods, written; see `ReducedMotion`.
-        bar: (bars, 3 + N) rate and acceleration of the lengths, written.
+        bar: (bars, 3 + N) columns LENGTH_RATE and LENGTH_BIAS, the rate and acceleration of the
+            pin-to-pin length, are written.
 
     Returns:
         Nothing.
@@ -192,22 +196,24 @@ _MAX_DEPENDENT_STEP = 0.3  # rad or m, maximum change of a dependent coordinate 
 
 @compile_without_allocation
 def close_loops(mech, m, z):
-    """Move to independent positions with all loops closed, and compute the dependent rates.
+    """Set the independent coordinates to given positions, close all loops, and compute the dependent rates.
 
-    The function starts from the last position, or from home if the last position is not finite. Its
-    steps are small enough to stay on the same branch of the linkages.
+    Newton's method computes the dependent coordinates. It starts from the last position in `m`, or
+    from home if the last position is not finite. The independent coordinates move in steps of less
+    than 0.2 rad or m (for distances up to 20), so that the linkages stay on the same branch.
 
     Args:
         mech: ReducedMechanism.
-        m: ReducedMotion; written are the frames of the links, the positions, the dependent rates per
-            independent rate (`basis`), and the closure equations with their factor (`loop`, `normal`).
+        m: ReducedMotion; written are the frames of the links, the positions, the dependent rates,
+            the rates of dependent per independent coordinates (`basis`), and the closure equations
+            with their factor (`loop`, `normal`). The independent rates are read.
         z: (>= n,) independent positions [rad] or [m].
 
     Returns:
         Maximum residual of a closure [m].
 
-    Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates r, with the dependent
-        (b) and independent (f) columns of their Jacobian.
+    Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates r, with the
+        dependent (b) and independent (f) columns of their Jacobian.
     """
     joint, free, bound = m.joint, mech.independent, mech.dependent
     n, nb, lost, far, worst = len(free), len(bound), False, 0.0, 0.0
@@ -345,22 +351,25 @@ class ReducedMotion(NamedTuple):
     """Workspace and result of the functions of this module, for f frames and N coordinates.
 
     Attributes:
-        frame: (f, FRAME_SIZE) columns ROTATION (9, row by row, rotation to the world), ORIGIN [m], SPIN
-            [rad/s], VELOCITY of the origin [m/s]; at zero joint acceleration SPIN_RATE [rad/s^2]
-            and ACCELERATION of the origin minus gravity [m/s^2]; FORCE (6), force [N] and torque
-            about the origin [N m] that this motion requires.
-        jacobian: (f, N, 6) d (velocity, spin) / d rates.
-        momentum: (f, N, 6) d (momentum, angular momentum about the origin) / d rates.
+        frame: (f, FRAME_SIZE) columns ROTATION (9, row by row, rotation to the world), ORIGIN [m],
+            SPIN (angular velocity) [rad/s], VELOCITY of the origin [m/s]; at zero joint
+            acceleration SPIN_RATE [rad/s^2] and ACCELERATION of the origin minus gravity [m/s^2];
+            FORCE (6), force [N] and torque about the origin [N m] that this motion requires,
+            including the support of the weight.
+        jacobian: (f, N, 6) derivatives of velocity and spin by the N coordinate rates.
+        momentum: (f, N, 6) derivatives of momentum and angular momentum about the frame's origin by
+            the rates.
         bar: (bars, 3 + N) columns LENGTH, pin to pin [m], LENGTH_RATE [m/s], LENGTH_BIAS,
-            acceleration of the length at zero joint acceleration [m/s^2], and from LENGTH_ROW on d
-            length rate / d rates.
+            acceleration of the length at zero joint acceleration [m/s^2], and from LENGTH_ROW on
+            the derivatives of the length rate by the N coordinate rates.
         mass: (N, N) mass matrix of the tree with its bars [kg m^2] or [kg].
         joint: (4, N) rows Q, positions, RATE, DRIFT, joint accelerations at zero independent
             acceleration, and BIAS, gravity and velocity forces [N m] or [N].
-        basis: (N, n) d rates / d independent rates.
-        loop: (3 closures, N + 2) d residual / d rates, residual [m] and its bias acceleration.
-        normal: (N - n + 1, N - n) normal matrix of the closures, with a right-hand side as the last
-            row.
+        basis: (N, n) derivatives of all coordinate rates by the n independent rates.
+        loop: (3 closures, N + 2) Jacobian of the closure residuals; then the residuals [m], and
+            their accelerations at zero joint acceleration [m/s^2].
+        normal: (N - n + 1, N - n) Cholesky factor of the normal matrix of the closure equations;
+            the last row holds a right-hand side or solution.
     """
 
     frame: np.ndarray
@@ -375,7 +384,7 @@ class ReducedMotion(NamedTuple):
 
 
 def make_reduced_motion(mech: ReducedMechanism) -> ReducedMotion:
-    """Allocate the work arrays of a reduced mechanism, with its joints at home and the world at rest."""
+    """Allocate the work arrays of a reduced mechanism, with its joints at their home positions and all rates 0."""
     f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.dependent)
     frame = np.zeros((f, FRAME_SIZE))
     frame[:, ROTATION : ROTATION + 9] = np.eye(3).ravel()
@@ -436,13 +445,14 @@ def rotate_to_world(frame, i, x, y, z):
 
 @compile_without_allocation
 def compute_frame_origin(tree, shape, frame, jacobian, i):
-    """Compute the world position of a frame's origin and its Jacobian, as a point fixed to the parent frame.
+    """Compute the world position of frame i's origin and its Jacobian, as a point fixed to the parent frame.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
         shape: (f, SHAPE_SIZE) geometry of the frames, see `ReducedMechanism`.
         frame: (f, FRAME_SIZE) frames, see `ReducedMotion`; the origin is written.
-        jacobian: (f, N, 6) velocities of the frames per joint rate; written, with the spin of the parent.
+        jacobian: (f, N, 6) velocities of the frames per joint rate; written, with the spin of the
+            parent.
         i: index of the frame.
 
     Returns:
@@ -467,11 +477,12 @@ def compute_frame_origin(tree, shape, frame, jacobian, i):
 
 @compile_without_allocation
 def compute_frame_origin_motion(tree, frame, i):
-    """Compute velocity, spin and accelerations of a frame as if it were fixed to its parent.
+    """Compute velocity, spin and accelerations of frame i as if it were fixed to its parent frame.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
-        frame: (f, FRAME_SIZE) frames after `compute_frame_origin`; the motion of frame i is written.
+        frame: (f, FRAME_SIZE) frames after `compute_frame_origin`; the motion of frame i is
+            written.
         i: index of the frame.
 
     Returns:
@@ -558,7 +569,8 @@ def compute_link_frames(tree, shape, links, joint, frame, jacobian):
 def compute_link_motion(tree, links, joint, frame, jacobian):
     """Compute velocity, spin and accelerations of every link from the joint rates.
 
-    The accelerations are those at zero joint acceleration. `compute_link_frames` comes first.
+    The accelerations are those at zero joint acceleration. `compute_link_frames` must be called
+    first.
 
     Args:
         tree: (f, 4) kinematic tree, see `ReducedMechanism`.
@@ -594,13 +606,13 @@ def compute_link_motion(tree, links, joint, frame, jacobian):
 def compute_mass_and_bias(mech, m):
     """Compute the mass matrix and bias forces of the tree with its bars (Kane's projection).
 
-    `M = sum J' P` and `h = sum J' F` over all bodies, with Jacobians J, momenta per unit rate P, and
-    wrenches F of inertia at zero joint acceleration and of gravity.
+    `M = sum J' P` and `h = sum J' F` over all bodies, with Jacobians J, momenta per unit rate P,
+    and wrenches F of inertia at zero joint acceleration and of gravity.
 
     Args:
         mech: ReducedMechanism.
-        m: ReducedMotion after `close_loops`; `momentum`, `mass`, the columns FORCE of `frame` and
-            the row BIAS of `joint` are written.
+        m: ReducedMotion with the motion of links and bars; `momentum`, `mass`, the columns FORCE of
+            `frame` and the row BIAS of `joint` are written.
 
     Returns:
         Nothing.

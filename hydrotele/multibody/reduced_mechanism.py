@@ -146,7 +146,7 @@ def _shape_row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0,
 
 
 def _append_coordinate_end(tree: np.ndarray) -> np.ndarray:
-    """Append the column COORDINATE_END to `tree` (f, 3): one plus the last coordinate that moves a frame.
+    """Return `tree` (f, 3) with the column COORDINATE_END: one plus the last coordinate that moves the frame.
 
     Tube and rod of a bar both get the larger of their two values.
     """

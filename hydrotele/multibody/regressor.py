@@ -29,20 +29,22 @@ _NODES, _WEIGHTS = hermegauss(21)
 class FrictionTerm:
     """Friction of one joint or closure, linear in its parameters.
 
-    With `way = tanh(v/v_0)`, the friction is `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v
-    + quadratic v^2 way`, plus asymmetry terms in which `way` is replaced by `way^2` and `v` by
-    `v way`. Near zero speed the friction may deviate from this law by
-    `low_speed_i exp(-(v/w_i)^2) way + reversal_i exp(-(v/w_i)^2) sign(dv/dt)`: the first is a
-    function of the speed, the second differs before and after a reversal, as with elastic contacts.
+    With the velocity v and `way = tanh(v/v_0)`, the friction is `(coulomb + stribeck
+    exp(-(v/v_s)^2)) way + viscous v + quadratic v^2 way`. Asymmetry terms are added, in which `way`
+    is replaced by `way^2` and `v` by `v way`. Near zero speed the friction may deviate from this
+    law by `low_speed_i exp(-(v/w_i)^2) way + reversal_i exp(-(v/w_i)^2) sign(dv/dt)`. The first
+    deviation is a function of the speed. The second differs before and after a reversal of the
+    motion, as with elastic contacts.
 
     Attributes:
         location: name of a joint, or of a closure whose bodies rotate relative to each other.
-        nominal: parameter -> value; each parameter has one column. See `FRICTION_TERMS`.
+        nominal: parameter -> nominal value; each parameter has one column of the regressor. Valid
+            names are in `FRICTION_TERMS`, and `low_speed_1`, `reversal_1` and so on.
         smoothing: v_0 [rad/s] or [m/s]; 0 uses the sign of v.
         stribeck: v_s [rad/s] or [m/s].
         low_speeds: w_1, w_2, ... [rad/s] or [m/s].
-        rest_speed: speed below which the joint is at rest [rad/s] or [m/s]. Its dry friction is then any
-            force within the Coulomb friction, and 0 here.
+        rest_speed: speed below which the joint is at rest [rad/s] or [m/s]. Its dry friction is
+            then any force within the Coulomb friction, and 0 here.
     """
 
     location: str
@@ -57,7 +59,8 @@ class FrictionTerm:
 
         Args:
             velocity: velocities of any shape [rad/s] or [m/s].
-            acceleration: accelerations at these velocities; 0 averages motion away from and towards zero speed.
+            acceleration: accelerations at these velocities; their sign matters for the `reversal`
+                parameters only. With 0, the friction of these parameters is 0.
 
         Returns:
             Parameter -> friction per unit of the parameter, in the shape of `velocity`.
@@ -73,7 +76,7 @@ DEVIATION_TERMS = ("low_speed", "reversal")  # deviations near zero speed, with 
 
 
 def is_friction_deviation(name: str) -> bool:
-    """Return whether a parameter name, such as `low_speed_1.knee`, is a friction deviation near zero speed."""
+    """Return whether a name is that of a friction deviation near zero speed, such as `low_speed_1.knee`."""
     return name.partition(".")[0].rpartition("_")[0] in DEVIATION_TERMS
 
 
@@ -113,9 +116,10 @@ def make_regressor(
         drives: names of the drives of the projection; those of the chain by default.
         bodies: bodies whose ten inertial parameters have columns; all by default.
         friction: friction terms.
-        offsets: whether every drive has a constant force, such as a transducer offset; or nominal
-            offsets by drive [N] or [N m].
-        drive_inertia: joints whose drive has its own inertia.
+        offsets: whether every drive has a parameter for a constant force, such as a transducer
+            offset. A mapping drive -> nominal offset [N] or [N m] also adds these parameters, 0 for
+            other drives.
+        drive_inertia: joints whose drive has a parameter for its own inertia.
         rate_std: (n, v) standard deviation of the joint rates [rad/s] or [m/s]. The friction of a
             joint is then its expected value over the distribution of the rate. This avoids a bias
             where noise makes the sign of the rate uncertain. Friction in closures is not averaged.
@@ -167,7 +171,7 @@ def friction_sign_std(
     chain: Chain, projection: Projection, drives: Sequence[str], friction: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return how uncertain the sign of dry friction in the drives is, because their rates are noisy.
+    """Return the standard deviation of the sign of dry friction in the drives, caused by noise of their rates.
 
     Args:
         chain: the chain.
@@ -177,7 +181,8 @@ def friction_sign_std(
         rate_std: (n, v) as in `make_regressor`.
 
     Returns:
-        (n, k) standard deviation of the sign (-1 .. 1) of dry friction, 0 .. 1; 1 below the `rest_speed`.
+        (n, k) standard deviation of the sign (-1 .. 1) of dry friction, 0 .. 1. It is 1 at rates
+            below the term's `rest_speed`, and 0 for drives without a friction term.
     """
     out, weights = np.zeros((len(projection.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
     for one in friction:

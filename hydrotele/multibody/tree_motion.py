@@ -65,7 +65,8 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
         q: (v,) joint positions [rad] or [m].
         rate: (v,) joint rates [rad/s] or [m/s].
         acceleration: (v,) joint accelerations [rad/s^2] or [m/s^2].
-        ground: (3,) acceleration of the world, such as minus gravity [m/s^2].
+        ground: (3,) acceleration of the world, which all accelerations include [m/s^2]; minus
+            gravity accounts for the weight of the bodies.
         frames: Frames, written.
     """
     set_vector(frames.origin, 0, (0.0, 0.0, 0.0))

@@ -29,7 +29,7 @@ def add_vectors(a, b):
 
 @compile_without_allocation
 def subtract_vectors(a, b):
-    """Return the difference of two vectors."""
+    """Return the difference a - b of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
@@ -47,15 +47,16 @@ def dot(a, b):
 
 @compile_without_allocation
 def cross(a, b):
-    """Return the cross product of two vectors."""
+    """Return the cross product a x b of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compile_without_allocation
 def point_acceleration(w, dw, arm):
-    """Return the acceleration `dw x r + w x (w x r)` of a body's point at r = `arm` from its fixed origin.
+    """Return the acceleration `dw x r + w x (w x r)` of a body's point relative to the body's origin.
 
-    w and dw are angular velocity [rad/s] and angular acceleration [rad/s^2].
+    r = `arm` is the vector from origin to point [m]. w and dw are angular velocity [rad/s] and
+    angular acceleration [rad/s^2].
     """
     return add_vectors(cross(dw, arm), cross(w, cross(w, arm)))
 
@@ -114,12 +115,13 @@ _MIN_RANK_RATIO = 1e-7  # minimum ratio of an orthogonalised column to the large
 
 @compile_without_allocation
 def qr_factor(matrix, columns, q, r):
-    """Compute the QR factorisation of selected columns of a matrix, by modified Gram-Schmidt done twice.
+    """Compute the QR factorisation of the columns `columns` of a matrix, by modified Gram-Schmidt done twice.
 
-    `q` (rows, count) and `r` (count, count) are written.
+    `q` (rows, count) and the upper triangle of `r` (count, count) are written, incompletely if the
+    factorisation fails.
 
     Returns:
-        Whether the columns are linearly independent.
+        Whether the columns are linearly independent; otherwise the factorisation fails.
     """
     rows, count, size = len(matrix), len(columns), 0.0
     for j in range(count):

@@ -2,11 +2,10 @@
 
 A device replaces the joystick of the machine's operator. It returns six axes of the joystick's handle:
 x outwards, y to the left, z up, and the rotations rx (the head), ry (the tool; positive curls it in)
-and rz. It also returns commands of machine axes that the joystick does not move ("additional axes")
-and whether to stop. The viewer window reports only
-key presses, not releases. Each press therefore moves an axis by a fraction of its range, and the
-space bar centres all axes. Gamepad and SpaceMouse are read with pygame (the extra `drive`) through
-SDL, which treats both as joysticks.
+and rz. It also returns commands of machine axes that the joystick does not move ("additional
+axes"), and whether to stop. The viewer window reports only key presses, not releases. Each press
+therefore moves an axis by a fraction of its range, and the space bar centres all axes. Gamepad and
+SpaceMouse are read with pygame (the extra `drive`) through SDL, which treats both as joysticks.
 
 A script file is CSV or YAML. CSV has a header (`time`, any of x, y, z, rx, ry, rz, and additional
 axes of the machine) and one row per time [s], valid from that time on. YAML has `time`, `axes`,
@@ -115,7 +114,8 @@ class SwitchedCommands:
     def cycle_command(self, number: int) -> None:
         """Advance the command of the axis with this index in the cycle 0, 1, 0, -1.
 
-        One button then suffices for the axis.
+        One button then suffices for the axis. The sign of the next nonzero command is common to all
+        axes.
         """
         if number < len(self.commands):
             now = self.commands[number]
@@ -232,7 +232,7 @@ class Keyboard:
         self._pending_keys.append(code)
 
     def read(self, time: float) -> Reading:
-        """Process the queued key presses and return the current input."""
+        """Process the key presses since the last call and return the current input; `time` is not used."""
         while self._pending_keys:
             self._apply_key(self._pending_keys.popleft())
         return Reading(tuple(self._axes.values()), tuple(self._switches.commands), self._quit)
@@ -277,7 +277,10 @@ class JoystickDevice:
         self._switches, self._pressed_buttons = SwitchedCommands(further), set()
 
     def read(self, time: float) -> Reading:
-        """Return the current input; the handle is centred while the device is unplugged."""
+        """Return the current input, with a message if the device was unplugged or connected again.
+
+        While it is unplugged, the handle is centred. `time` is not used.
+        """
         said = ""
         if self._sticks.poll_connections():
             before, self._stick = self._stick, self._sticks.find(self._kind)
@@ -296,8 +299,10 @@ class JoystickDevice:
     def _apply_buttons(self, held: set[str]) -> bool:
         """Change the switched commands by newly pressed buttons.
 
+        The stop button, or all cycle buttons together, set the commands to 0.
+
         Args:
-            held: buttons that are pressed, and directions of the hat.
+            held: buttons that are pressed now, and directions of the hat.
 
         Returns:
             Whether the quit button is newly pressed.
@@ -371,12 +376,16 @@ class SdlJoysticks:
         pygame.joystick.init()
 
     def poll_connections(self) -> bool:
-        """Update the device states; return whether a device was connected or disconnected."""
+        """Update the device states; return whether a device was plugged in or removed since the last call."""
         kinds = (self._pygame.JOYDEVICEADDED, self._pygame.JOYDEVICEREMOVED)
         return any(event.type in kinds for event in self._pygame.event.get())
 
     def find(self, kind: str) -> Any:
-        """Return the first connected device of a kind as a pygame joystick, or None."""
+        """Return the first connected device of a kind as a pygame joystick, or None.
+
+        For the kind `spacemouse` the name of the device must contain `space` or `3dconnexion`; any
+        other device counts as a `gamepad`.
+        """
         for number in range(self._pygame.joystick.get_count()):
             stick = self._pygame.joystick.Joystick(number)
             named = any(part in stick.get_name().lower() for part in SPACEMOUSE_NAMES)
@@ -393,7 +402,11 @@ _UnitRangeFloat = Annotated[float, Field(ge=-1, le=1)]
 
 
 class Script(StrictModel):
-    """Input over time: values of the handle `axes` and `commands` of additional axes."""
+    """Input over time: values of the handle `axes` and `commands` of additional axes.
+
+    `time` [s] holds the times of the rows. All values are -1 .. 1. `interpolate` says whether the
+    handle values are held or interpolated linearly between rows; commands are always held.
+    """
 
     time: list[NonNegativeFloat]
     axes: dict[JoystickAxis, list[_UnitRangeFloat]] = {}
@@ -432,7 +445,7 @@ class ScriptedDevice:
         self._script, self._further = script, further
 
     def read(self, time: float) -> Reading:
-        """Return the input of the script at a time of the run [s]."""
+        """Return the input of the script at a time of the run [s]; it stops the drive at the last time."""
         script = self._script
         row = max(0, bisect.bisect_right(script.time, time + 1e-9) - 1)
         commands = [script.commands[n][row] if n in script.commands else 0.0 for n in self._further]
@@ -451,7 +464,7 @@ class ScriptedDevice:
 
 
 def load_script(path: str | Path) -> Script:
-    """Read a script file: recorded or written input of a device over time.
+    """Read a script file: the input of a device over time.
 
     Args:
         path: a CSV or YAML file.
@@ -525,7 +538,7 @@ def open_device(name: str, additional_axes: tuple[str, ...]) -> Device:
     """Open an input device by name.
 
     Args:
-        name: one of `DEVICE_NAMES`.
+        name: `keyboard`, `gamepad`, `spacemouse` or `scripted:FILE`.
         additional_axes: axes that the joystick does not move, in the order of the machine.
 
     Returns:

@@ -89,7 +89,10 @@ class HapticHandle:
         station.attach_device(self.link.exchange)
 
     def read(self, time: float) -> Reading:
-        """Return the commands of the buttons, and a message when the connection changes."""
+        """Return the commands switched by the buttons, and a message when the connection changes.
+
+        The handle axes of the reading are 0, because the device itself replaces the joystick.
+        """
         pose = self.link.pose()
         said = self._connection_message(pose is not None, self.link.engaged)
         if pose:
@@ -101,6 +104,8 @@ class HapticHandle:
 
     def _connection_message(self, is_connected: bool, engaged: bool) -> str:
         """Return a message if the state of the connection has changed, otherwise an empty text.
+
+        If the device no longer answers, all commands of the buttons are set to 0.
 
         Args:
             is_connected: whether the device has answered recently.
@@ -131,7 +136,7 @@ _MIN_SLEEP = 0.002  # s: shorter waits are skipped, because a sleep is not that 
 
 
 class TimeKeeper(Protocol):
-    """Synchronises simulated time with the wall clock.
+    """Interface of a timer that synchronises simulated time with the wall clock.
 
     Attributes:
         pauses: number of times that simulated time was paused.
@@ -159,7 +164,7 @@ class TimeKeeper(Protocol):
 
 
 class Pacer:
-    """Synchronises simulated time with the wall clock; pauses it if the computer is too slow.
+    """Timer that synchronises simulated time with the wall clock, and pauses it if the computer is too slow.
 
     Attributes:
         pauses: number of pauses.
@@ -184,7 +189,8 @@ class Pacer:
     def wait_for_tick(self, simulated: float) -> float:
         """Wait until the wall clock reaches a simulated time.
 
-        If the simulation is more than 0.25 s late, simulated time is paused instead: it is not made up.
+        If the simulation is more than 0.25 s late, this lateness counts as a pause of simulated
+        time. The simulation then continues at normal speed instead of catching up.
 
         Args:
             simulated: simulated time so far [s].
@@ -220,7 +226,7 @@ class LiveHandReference:
     """
 
     def __init__(self, further: dict[str, float]) -> None:
-        """Start at the centre.
+        """Start with a centred handle and with all commands 0.
 
         Args:
             further: axis that the joystick does not move -> command limit.
@@ -236,9 +242,10 @@ class LiveHandReference:
         return self._reference
 
     def apply_reading(self, reading: Reading, session: Session) -> None:
-        """Set handle reference and commands of a session from a device reading, and record the changes.
+        """Set handle reference and commands of a session from a device reading, and record their changes.
 
-        They apply from the next control tick on.
+        A device axis of -1 .. 1 is mapped to `travel_range`, and a command to its limit. Both apply
+        from the next control tick on.
         """
         if reading.axes != self._before.axes:
             part, (dead, stop) = np.array(reading.axes), self.travel_range
@@ -253,10 +260,11 @@ class LiveHandReference:
         self._before = reading
 
     def record_handle(self, handle: np.ndarray, time: float) -> None:
-        """Record the measured handle position (6,) [m], [rad] of a haptic device at a run time [s].
+        """Record the measured handle position (6,) [m], [rad] of a haptic device at a time of the run [s].
 
-        When the recorded scenario is simulated again, a simulated hand follows this position. Its arm
-        dynamics make the new run similar, but not bit-identical.
+        The position is rounded to 5 decimals. When the recorded scenario is simulated again, a
+        simulated hand follows it. The dynamics of its arm make the new run similar, but not
+        bit-identical.
         """
         wanted = [round(value, _HANDLE_DECIMALS) for value in handle.tolist()]
         if wanted != self._reference.tolist():
@@ -292,10 +300,11 @@ class Status(NamedTuple):
     Attributes:
         time: simulated time [s].
         handle: (6,) displacement of the handle [m], [rad].
-        hand_force: (6,) force of the hand, as estimated by the joystick [N], [N m].
-        tip_force: task coordinate -> reflected tip force [N], [N m].
-        total_contact_force: (3,) total contact force in the world frame [N].
-        commands: additional axis -> command.
+        hand_force: (6,) force of the hand on the handle, as estimated by the joystick [N], [N m].
+        tip_force: task coordinate, such as `r` or `z` -> estimated force at the tip [N], [N m].
+        total_contact_force: (3,) sum of the contact forces of ground and objects on the machine,
+            world frame [N].
+        commands: axis that the joystick does not move -> command.
     """
 
     time: float
@@ -326,7 +335,7 @@ TickCallback = Callable[[Session, Callable[[], Status], float], bool]
 
 
 def axes_not_moved_by_joystick(machine: Machine) -> dict[str, float]:
-    """Return machine axis -> command limit, for the axes that the joystick does not move.
+    """Return axis name -> command limit, for the machine axes that the joystick does not move.
 
     The limit is 1 for valves and in the unit of the drive for others.
     """
@@ -421,7 +430,7 @@ def drive_scenario(
 
 
 class _MessageReporter:
-    """Reporter that passes each new note and event of a session to the user once."""
+    """Reporter that passes each new note and event of a session to the user once, and reports pauses."""
 
     def __init__(self, session: Session, say: Callable[[str], None]) -> None:
         assert session.station

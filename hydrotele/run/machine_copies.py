@@ -22,7 +22,7 @@ class CopiedMachine(NamedTuple):
 
     Attributes:
         name: path of the machine file in the sweep folder; the original path if the machine cannot
-            be copied.
+            be copied because it needs files in addition to its MJCF file.
         files: path in the sweep folder -> content; empty if the machine cannot be copied.
     """
 
@@ -40,7 +40,8 @@ class MachineCopies:
     def with_copied_paths(self, scenario: Scenario) -> Scenario:
         """Return the scenario with its user machines replaced by the paths of their copies.
 
-        The paths are relative to the sweep folder. Machines that are new are read.
+        The paths are relative to the sweep folder, and the `folder` of the scenario becomes empty.
+        The files of a new machine are read.
 
         Raises:
             InputError: a machine file cannot be read.
@@ -55,11 +56,11 @@ class MachineCopies:
         return scenario.model_copy(update=changes)
 
     def files(self) -> Files:
-        """Return path in the sweep folder -> content of the files of all machines read so far."""
+        """Return the files of all machines read so far, as path in the sweep folder -> content."""
         return {name: text for copied in self._known.values() for name, text in copied.files.items()}
 
     def files_of(self, scenario: Scenario) -> Files:
-        """Return path in the sweep folder -> content of the machine files that one scenario uses.
+        """Return the machine files that one scenario uses, as path in the sweep folder -> content.
 
         The scenario is a result of `with_copied_paths`.
         """
@@ -69,6 +70,9 @@ class MachineCopies:
 
     def check_sendable(self, where: str) -> None:
         """Check that all machines can be sent to other computers.
+
+        Args:
+            where: option or file for the error message.
 
         Raises:
             InputError: a machine needs files in addition to its MJCF file.
@@ -101,7 +105,9 @@ def _copy_machine(file: Path) -> CopiedMachine:
 
 
 def with_resolved_paths(scenario: Scenario, folder: Path) -> Scenario:
-    """Return the scenario with its machine paths, which are relative to a sweep folder, in that folder.
+    """Return the scenario with machine paths that are valid in a given folder.
+
+    The paths were relative to a sweep folder; the copies of the machines are now in `folder`.
 
     Args:
         scenario: a result of `MachineCopies.with_copied_paths`.

@@ -35,7 +35,7 @@ class ChannelDifference:
 
     Attributes:
         rms: RMS difference [unit].
-        max: largest difference [unit].
+        max: largest absolute difference [unit].
         unit: SI unit.
         range: full scale of the channel [unit]: main relief pressure for pressures, stroke for
             lengths, otherwise the range of the measured values.
@@ -66,7 +66,10 @@ class Replay:
     realtime_factor: float
 
     def __repr__(self) -> str:
-        """Return the logs that were compared and the channel with the largest error."""
+        """Return a text with the source of the log, the number of channels and the worst channel.
+
+        The worst channel has the largest RMS error relative to its range.
+        """
         text = f"Replay({self.measured.source!r}, {len(self.channels)} channels"
         if self.channels:
             name, worst = max(self.channels.items(), key=lambda item: item[1].rms / (item[1].range or math.inf))
@@ -80,13 +83,13 @@ def replay_log(
     timestep: float = 1.0e-3,
     progress: Callable[[float, float], None] | None = None,
 ) -> Replay:
-    """Simulate a machine with the commands of a log and compare the channels.
+    """Simulate a machine with the commands of a log and compare simulated with measured channels.
 
     The simulation starts from the `initial_state` metadata of the log. Without it, the first row
     gives the positions and pressures; velocities are zero and spools are closed. Before the first
     row the machine is assumed to be at rest with its rest commands, which matters for delayed
     commands. The scene contains a ground only if the metadata of the log has `ground: yes`, and soil
-    to dig only if they name it; the soil then moves once per row.
+    to dig only if these metadata name it; the soil then moves once per row.
 
     The compared values are the sensor readings without noise, including offsets, scales and delays.
     For a log with `truth.*` columns they are the true values.
@@ -95,7 +98,7 @@ def replay_log(
         log: the log; must contain the command and the position of every axis.
         machine: the machine.
         timestep: largest physics step [s]; it is reduced to fit a whole number into one log row.
-        progress: called periodically with (simulated seconds, total seconds).
+        progress: callback, called periodically with (simulated seconds, total seconds).
 
     Returns:
         The replay.
@@ -142,9 +145,9 @@ def replay_log(
 
 
 def _used_rows(log: Log, channel: str) -> np.ndarray:
-    """Return (n,) whether a replay needs the value of a channel in a row of the log.
+    """Return for each of the n rows of a log whether a replay needs the value of a channel there, (n,) bool.
 
-    It needs the commands of all rows, and of other channels only the first row.
+    A replay needs commands in all rows, and the other channels only in the first row.
     """
     return np.full(len(log), True) if channel.startswith("command.") else np.arange(len(log)) == 0
 
@@ -266,9 +269,10 @@ def _compute_channel_differences(log: Log, simulated: Log, machine: Machine) -> 
 
 
 def _full_scale(machine: Machine, channel: str) -> float | None:
-    """Return the full scale of a channel, to which its errors are related.
+    """Return the full scale of a channel, relative to which its errors are reported.
 
-    It is the relief pressure for pressures [Pa] and the stroke for lengths [m], otherwise None.
+    It is the main relief pressure for pressures [Pa] and the stroke of the cylinder for lengths
+    [m]; None for other channels.
     """
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure") and machine.supply:

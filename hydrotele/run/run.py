@@ -57,14 +57,17 @@ def summarise(
     max_pin_opening: float,
     computing_seconds: float,
 ) -> dict[str, Any]:
-    """Return the content of `summary.json`, without the flow and energy balances.
+    """Return the entries of `summary.json` of a run: settings, speed, largest forces, tracking errors, versions.
+
+    The flow and energy balances are not included; `finish_run` adds them.
 
     Args:
         plant: the simulated machine.
         scenario: the scenario.
         plan: reference and commands of every axis.
         record: states at the log rows.
-        max_pin_opening: largest pin opening at a control tick [m].
+        max_pin_opening: largest distance between the two halves of a pin of a closed loop, at any
+            control tick [m].
         computing_seconds: computing time of the tick loop [s].
 
     Returns:
@@ -106,10 +109,10 @@ def _find_impossible_states(plant: Plant, record: Record) -> list[str]:
 
 
 def _tracking_errors(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
-    """Return RMS and maximum of the tracking errors of a run, as name -> rms, max and unit.
+    """Return RMS and largest absolute value of the tracking errors of a run: name -> `rms`, `max`, `unit`.
 
-    The errors are actual minus reference position of every closed-loop axis. If the plan gives a pose of
-    the arm's tip, those of radius, height and attitude are included.
+    The errors are true minus reference position of every closed-loop axis, at the log rows. If the
+    plan gives a pose of the arm's tip, those of radius, height and attitude are included.
     """
     rows = np.searchsorted(plan.time, record.time - 1e-9)
     result: dict[str, Any] = {}
@@ -191,7 +194,7 @@ class Run:
 
 
 def load_nominal_machine(scenario: Scenario) -> Machine:
-    """Load the machine of a scenario as its controller knows it, without the scenario's effects.
+    """Load the machine of a scenario as its controller knows it: without the scenario's effects.
 
     Raises:
         InputError: unknown machine or tool.
@@ -244,7 +247,7 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
 
     Args:
         scenario: the scenario.
-        progress: called periodically with (simulated seconds, total seconds).
+        progress: callback, called periodically with (simulated seconds, total seconds).
 
     Returns:
         The run.
@@ -280,7 +283,10 @@ def start_session(scenario: Scenario, hand: HandInput | None = None) -> Session:
 
 
 def finish_run(session: Session, scenario: Scenario) -> Run:
-    """Stop a session and return its run with logs, summary and balances.
+    """Stop a session and return its run with logs and summary.
+
+    The balances of oil volume and energy in the summary come from a repeated simulation of the
+    first 5 s.
 
     Args:
         session: the session after its last tick.
@@ -327,13 +333,14 @@ def _add_station_channels(log: Log, station: TeleoperationLog, scenario: Scenari
 
 
 def _make_logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
-    """Return the log of the true values and the log of the sensor readings of a run.
+    """Return two logs of a run: (true values, sensor readings).
 
     Args:
         plant: the simulated machine.
         scenario: the scenario.
         record: states at the log rows.
-        seen: readings that the controller used; the second log has the same sensor errors.
+        seen: sensor feedback of the controller; its random sensor errors are also those of the
+            second log.
     """
     machine = plant.machine
     values, units = true_channels(plant, record)
@@ -425,9 +432,10 @@ def _describe_initial_state(plant: Plant, record: Record) -> dict[str, Any]:
 
 
 def _initial_internal_states(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
-    """Return the states in addition to motion, spools and pressures at the first row of a run.
+    """Return the internal states of a machine at the first row of a run, as kind -> owner -> value.
 
-    They belong to friction before sliding, pump and added effects: kind -> owner -> value.
+    They are the states in addition to motion, spools and pressures: those of friction before
+    sliding, of the pump and of added effects. The owner is an axis or another part.
     """
     found: dict[str, dict[str, float]] = {}
     for name, place in plant.extra_states.items():

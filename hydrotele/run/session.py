@@ -41,7 +41,7 @@ from hydrotele.teleop.teleoperation_system import TeleoperationSystem
 
 
 class PreparedRun(NamedTuple):
-    """A machine, its initial state and a plan: all that a scenario needs for its first step.
+    """A machine, its initial state and a plan: all that is needed to start the run of a scenario.
 
     Attributes:
         plant: the simulated machine.
@@ -65,8 +65,9 @@ class SessionResult(NamedTuple):
         plan: reference and commands of every axis.
         record: states at the log rows.
         commands: (n, nu) commands by control tick.
-        max_pin_opening: largest pin opening [m].
-        computing_seconds: computing time [s] without the first tick, which loads compiled code.
+        max_pin_opening: largest distance between the two halves of a pin of a closed loop [m].
+        computing_seconds: real time from the end of the first call of the compiled loop, which
+            loads compiled code, to `finish` [s].
         station: operator station of a teleoperated run, otherwise None.
         events: (time [s], description) of events in the surroundings, such as a falling tree.
         soil: soil that the bucket has dug, None if there is none.
@@ -90,7 +91,7 @@ class Session:
         data: its MuJoCo data; positions and velocities are half a physics step apart, as in leapfrog
             integration (`simulate.record`).
         scenario: the scenario.
-        sensor_feedback: sensor feedback of the controller.
+        sensor_feedback: sampled sensor readings that the controller uses.
         station: operator station of a teleoperated run, otherwise None.
         initial_physics_state: full physics state before the first tick.
         initial_commands: (nu,) commands before the first tick.
@@ -178,10 +179,10 @@ class Session:
                 self._begin = clock.perf_counter()
 
     def _run_ticks(self, end: int) -> None:
-        """Run control ticks in compiled code up to tick `end` or to one at which Python must act.
+        """Run control ticks in compiled code up to tick `end`, or up to a tick at which Python must act.
 
-        Python acts if surroundings change, sensor readings must be recorded, or the operator station needs
-        it. The current tick is advanced by at least one.
+        Python acts if surroundings change, sensor readings must be recorded, or the operator
+        station must be prepared or checked. The current tick is advanced by at least one.
         """
         first, station, stepper = self.tick, self.station, self._stepper
         if self._around.needs_update or not first:
@@ -212,7 +213,7 @@ class Session:
             self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:
-        """Set the command of an axis without a joystick axis, from the next tick on.
+        """Set the command of an axis that the joystick does not move, from the next tick on.
 
         Args:
             axis: name of the axis; a button of the scenario must refer to it.
@@ -230,7 +231,7 @@ class Session:
         return self._around.events
 
     def finish(self) -> SessionResult:
-        """Stop the run and return its result, without an incomplete last log row.
+        """Stop the run and return its result; an incomplete last log row is left out of the record.
 
         Raises:
             InputError: the run has fewer than the ten rows that a log needs.

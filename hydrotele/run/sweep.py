@@ -62,7 +62,7 @@ _DASK_OPTION = "--dask"
 
 
 def run_on_cluster(tasks: Iterable[RunTask], address: str) -> Generator[Outcome]:
-    """Execute runs on a dask cluster; more runs than threads are submitted at a time.
+    """Execute runs on a dask cluster; more runs than it has threads are submitted at a time.
 
     Args:
         tasks: the runs; taken as workers become free.
@@ -172,7 +172,8 @@ def result_versions() -> dict[str, str]:
 def sweep_identity(base: SweepBase, checked: CheckedSweep) -> dict[str, Any]:
     """Return the data that must be equal for a sweep to continue in an existing folder.
 
-    They are the content of the sweep file, a hash of all scenarios, and the package versions.
+    They are the entries of the sweep file that affect results, a hash of all scenarios, and the
+    package versions.
     """
     facts = base.file.sweep.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
     return {"sweep": facts, "scenarios": checked.digest, "versions": result_versions()}
@@ -180,7 +181,11 @@ def sweep_identity(base: SweepBase, checked: CheckedSweep) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def open_sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fresh: bool) -> Iterator[None]:
-    """Create the folder of a sweep or continue an existing one, with exclusive access.
+    """Create the folder of a sweep or continue an existing one, with exclusive access while the context is open.
+
+    A new folder gets copies of the user machines and `summary.json`. In each case, hidden leftovers
+    of killed processes are deleted, and `sweep.yaml` and a scratch folder are written. The scratch
+    folder is deleted at the end.
 
     Args:
         target: the folder.
@@ -220,7 +225,7 @@ def open_sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fres
 
 
 def write_summary(folder: Path, base: SweepBase, facts: dict[str, Any]) -> None:
-    """Write `summary.json` of a sweep folder: kind, name, number of runs, and further entries."""
+    """Write `summary.json` of a sweep folder: kind, name, number of runs, and the entries `facts`."""
     summary = {"kind": KIND, "name": base.file.name, "runs": base.file.sweep.runs, **facts}
     with atomic_file(folder / "summary.json", ".json") as part:
         part.write_text(json.dumps(summary, indent=2) + "\n")
@@ -258,7 +263,7 @@ def _lock_folder(target: Path) -> Iterator[None]:
 
 
 def _describe_differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
-    """Yield the differences between two results of `sweep_identity` as sentences.
+    """Yield the differences between two results of `sweep_identity` as texts.
 
     A changed hash of the scenarios is named only if nothing else differs.
     """
@@ -387,9 +392,10 @@ def _dead_worker_outcome(worker: _Worker) -> Outcome:
 
 @contextlib.contextmanager
 def _child_process_environment() -> Iterator[None]:
-    """Give processes that are started in the context one thread each, and let them ignore Ctrl-C.
+    """Set up an environment in which a child process uses one thread and ignores Ctrl-C.
 
-    The calling process handles Ctrl-C for them.
+    Processes started while the context is open inherit it. The calling process handles Ctrl-C for
+    them; its own settings are restored at the end.
     """
     old = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -406,7 +412,10 @@ def _child_process_environment() -> Iterator[None]:
 
 
 def _worker_main(connection: Connection) -> None:
-    """Execute runs received over a connection and send back the outcomes, until the parent process ends."""
+    """Announce readiness, then execute runs received over a connection and send back the outcomes.
+
+    The process ends when its parent process ends.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tasks: queue.SimpleQueue[RunTask] = queue.SimpleQueue()
     threading.Thread(target=_receive_tasks, args=(connection, tasks), daemon=True).start()
@@ -502,12 +511,14 @@ def run_sweep(
 
 
 def _find_missing_runs(base: SweepBase, journal: Journal, retry_failed: bool) -> dict[int, Point]:
-    """Return run number -> point, for the runs that the journal does not contain.
+    """Return run number -> point, for the runs of a sweep that are still to be executed.
+
+    These are the runs that the journal does not contain.
 
     Args:
         base: the sweep.
         journal: journal of the finished runs.
-        retry_failed: include the failed runs.
+        retry_failed: include the runs that failed.
     """
     if retry_failed:
         done = {run for run, entry in journal.entries.items() if entry.status == OK}
@@ -574,7 +585,7 @@ def _check_versions(outcome: Outcome) -> None:
 
 
 def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outcome) -> None:
-    """Write the files of a run to its folder `runs/NUMBER` of a sweep: all or none."""
+    """Write the files of a run and its scenario to the folder `runs/NUMBER` of a sweep: all or none."""
     name = f"{point.run:0{max(4, len(str(base.file.sweep.runs)))}d}"
     with atomic_folder(target / "runs" / name, "run") as folder:
         for file, content in outcome.files.items():
@@ -587,7 +598,10 @@ def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outc
 
 
 def _save_timings(entries: dict[int, JournalEntry], path: Path) -> None:
-    """Write the computing times, which differ between equal runs, to a separate CSV file."""
+    """Write run number and computing time [s] of every run to a CSV file.
+
+    The times are not in the table of the sweep, because they differ between equal runs.
+    """
     with atomic_file(path, ".csv") as part, open(part, "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["run", "wall [s]"])

@@ -61,7 +61,7 @@ Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_check_grid_va
 
 
 class Distribution(StrictModel):
-    """Distribution of a sampled key; exactly one of the four forms is given.
+    """Random distribution of the values of a sampled key; exactly one of four forms is given.
 
     uniform [low, high], log_uniform [low, high] with low > 0, normal [mean, standard deviation], in
     the key's unit, or choice [values], all equally likely.
@@ -151,7 +151,7 @@ class SweepFile(NamedTuple):
     Attributes:
         path: path of the file.
         sweep: content of the file.
-        lines: key path -> line number, starting at 1.
+        lines: path of a key in the file, such as ("grid", "seed") -> line number, starting at 1.
     """
 
     path: Path
@@ -199,15 +199,15 @@ class SweepFile(NamedTuple):
 
 
 def shipped_sweeps() -> list[str]:
-    """Return the names of the sweeps in the package."""
+    """Return the names of the sweep files in the package, without ending, in alphabetical order."""
     return sorted(path.stem for path in (scenarios_folder() / "sweeps").glob("*.yaml"))
 
 
 def load_sweep(name_or_path: str | Path) -> SweepFile:
-    """Read a sweep file or a shipped sweep by name.
+    """Read and validate a sweep file, given by its path or by the name of a shipped sweep.
 
     Returns:
-        The validated sweep; `check_points` checks its points.
+        The sweep; its points are not checked yet, see `check_points`.
 
     Raises:
         InputError: the file is missing or invalid; the message names line, key and valid values.
@@ -226,7 +226,7 @@ def load_sweep(name_or_path: str | Path) -> SweepFile:
 
 
 class Point(NamedTuple):
-    """Varied values of one run.
+    """One run of a sweep: its number, the values of the varied keys, and its repetition.
 
     Attributes:
         run: run number, starting at 1.
@@ -240,7 +240,9 @@ class Point(NamedTuple):
 
 
 def iterate_points(sweep: Sweep) -> Iterator[Point]:
-    """Yield all points of a sweep: grid (last key fastest), then samples, then repetitions.
+    """Yield all points of a sweep in the order of the runs.
+
+    Repetitions vary fastest, then samples, then the keys of the grid from the last to the first.
 
     >>> from hydrotele.run.sweep_file import Sweep
     >>> [p.values["servo.lead"] for p in iterate_points(Sweep(scenario="a", grid={"servo.lead": [0, 0.1]}))]
@@ -290,7 +292,7 @@ def override_text(value: Any) -> str:
 
 
 def point_overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
-    """Return scenario key -> value as text, by which a run differs from the base scenario.
+    """Return the scenario keys that a run sets in the base scenario, as key -> value as JSON text.
 
     Args:
         sweep: the sweep, whose `set` applies to all runs.

@@ -27,8 +27,8 @@ class JournalEntry(NamedTuple):
         run: run number.
         status: OK or FAILED.
         reason: reason of a failure, otherwise empty.
-        numbers: numbers of the run's summary.
-        notes: notes of the run's summary, joined.
+        numbers: name -> (value, unit) of the numbers in the run's summary.
+        notes: notes of the run's summary, joined by semicolons.
         wall_seconds: computing time of the tick loop [s], None if the run failed.
     """
 
@@ -41,7 +41,7 @@ class JournalEntry(NamedTuple):
 
 
 def count_finished_runs(path: Path) -> int:
-    """Return the number of finished runs in the journal file of a sweep; 0 if it does not exist."""
+    """Return the number of distinct runs in the journal file of a sweep, failed ones included; 0 without a file."""
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
     return len({line.partition(b",")[0] for line in lines})
 
@@ -55,7 +55,7 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the entries, remove incomplete lines and open the file for appending.
+        """Read the entries, remove invalid or incomplete lines from the file, and open it for appending.
 
         Raises:
             InputError: the file cannot be read or written.
@@ -82,7 +82,7 @@ class Journal:
         return True
 
     def add(self, entry: JournalEntry) -> None:
-        """Append the entry of a run and flush it to disk.
+        """Append the entry of a run to the file, force it to disk, and add it to `entries`.
 
         Raises:
             InputError: the entry cannot be written, for example because the disk is full.

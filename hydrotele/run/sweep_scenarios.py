@@ -44,10 +44,10 @@ class CheckedSweep(NamedTuple):
     """Result of the check of all points.
 
     Attributes:
-        fingerprints: hash of the scenario of every run, in order.
+        fingerprints: 16-byte hash of the scenario of every run, in order.
         seed: seed of the first run.
-        units: varied effect parameter -> unit.
-        axes: axes of all machines.
+        units: unit of each varied key that is a parameter of an effect.
+        axes: names of the axes of all machines.
         teleoperated: whether any scenario is teleoperated.
     """
 
@@ -59,7 +59,7 @@ class CheckedSweep(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 hash of all scenarios in order."""
+        """SHA-256 hash of the hashes of all scenarios in order, as hexadecimal text."""
         return hashlib.sha256(b"".join(self.fingerprints)).hexdigest()
 
 
@@ -73,9 +73,9 @@ def read_base_scenario(file: SweepFile) -> SweepBase:
 
 
 def make_point_scenario(base: SweepBase, point: Point) -> Scenario:
-    """Return the scenario of one run of a sweep.
+    """Return the scenario of one run of a sweep, with the values and the repetition of a point.
 
-    It refers to the copies of user machines in the sweep folder.
+    Paths of user machines are those of their copies in the sweep folder.
 
     Raises:
         InputError: the scenario is invalid.
@@ -87,16 +87,17 @@ def make_point_scenario(base: SweepBase, point: Point) -> Scenario:
 def _make_repetition(base: SweepBase, scenario: Scenario, repetition_number: int) -> Scenario:
     """Return a copy of a scenario whose seed is increased by the number of the repetition.
 
-    It refers to the copies of user machines in the sweep folder.
+    Paths of user machines are those of their copies in the sweep folder.
     """
     seed = scenario.seed + repetition_number
     return base.machine_copies.with_copied_paths(scenario.model_copy(update={"seed": seed}))
 
 
 def hash_scenario(scenario: Scenario) -> bytes:
-    """Return a 16-byte hash of a scenario, which shows whether its content has changed.
+    """Return a 16-byte hash of the content of a scenario, by which a change is detected.
 
-    For a result of `make_point_scenario`, the folder of the scenario's files does not matter.
+    A result of `make_point_scenario` contains no absolute folder, so its hash does not depend on
+    where the files are.
     """
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 
@@ -106,7 +107,7 @@ def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSw
 
     Args:
         base: result of `read_base_scenario`.
-        progress: called periodically with (points checked, number of points).
+        progress: callback, called periodically with (points checked, number of points).
 
     Raises:
         InputError: a point is invalid; the message names file, line, key and valid values.
@@ -196,13 +197,16 @@ def _value_location(file: SweepFile, key: str, value: Any) -> str:
 
 
 def _message_without_options(error: InputError) -> str:
-    """Return the error message without the override options that the sweep generated."""
+    """Return the text of an error without a location that names a `--set` option, which the sweep generated.
+
+    Other locations are kept in front of the message.
+    """
     ours = error.where.startswith("--set ") or " with --set " in error.where
     return error.message if ours else str(error)
 
 
 def _effect_units(scenario: Scenario, varied: tuple[str, ...], machines: _Machines) -> dict[str, str]:
-    """Return key -> unit, for the varied keys that are parameters of effects."""
+    """Return the unit of each of the `varied` keys that is a parameter of an effect of the scenario."""
     units = {}
     for key in varied:
         parts = key.split(".")

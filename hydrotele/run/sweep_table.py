@@ -37,7 +37,7 @@ def make_table(
 
     Args:
         sweep: the sweep.
-        seed: seed of the base scenario.
+        seed: seed of the first run, used if the seed is not varied.
         entries: run number -> journal entry, for all runs.
         effect_units: varied effect parameter -> unit.
 
@@ -60,7 +60,7 @@ def make_table(
 
 
 def save_table(table: SweepTable, name: str, path: Path) -> None:
-    """Write the table atomically as Parquet; equal runs give identical files.
+    """Write the table atomically as a Parquet file with units; equal runs give identical files.
 
     Args:
         table: the table.
@@ -89,7 +89,10 @@ def save_table(table: SweepTable, name: str, path: Path) -> None:
 
 
 def _to_arrow_array(pa, values: Sequence[Any]):
-    """Return a column as an Arrow array of booleans, integers or floats; other values become JSON text.
+    """Return a column as an Arrow array of booleans, integers, floats or text.
+
+    A column with other or mixed values becomes text: strings stay as they are, the others become
+    JSON.
 
     Args:
         pa: the module pyarrow.
@@ -114,9 +117,10 @@ _FORCE_AND_BALANCE_FIGURES = (
 
 
 def choose_plotted_numbers(table: SweepTable) -> list[str]:
-    """Return the names of up to six numbers to plot: tracking errors, forces, balances.
+    """Return the names of up to six numbers to plot: RMS tracking errors first, then forces and balances.
 
-    Only numbers that differ between the runs are chosen.
+    The tracking errors of the tip precede those of the axes, which come last if there are errors of
+    the tip. Only numbers that differ between the runs are chosen.
     """
     axes = [n for n in table.number_names if n.startswith("tracking.") and n.endswith(".rms")]
     followed = [n for n in _TIP_FIGURES if n in axes] or axes
@@ -139,7 +143,8 @@ def compute_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[
         figures: column names.
 
     Returns:
-        Column name -> `unit`, `min`, `median`, `max`, and the runs `min_run` and `max_run`.
+        Column name -> `unit`, `min`, `median`, `max`, and `min_run` and `max_run`, the numbers of
+        the runs with minimum and maximum. Columns without values are omitted.
     """
     found = {}
     for name in figures:

@@ -1,4 +1,4 @@
-"""Execute one run of a sweep in any process or computer."""
+"""Execution of one run of a sweep, in any process or on any computer."""
 
 import math
 import tempfile
@@ -44,7 +44,8 @@ _TIP_COORDINATES = ("tip_r", "tip_z", "tip_attitude")
 def flatten_summary(summary: dict[str, Any]) -> Numbers:
     """Return the numbers of a run's summary as dotted name -> (number, unit).
 
-    Timings and versions, which differ between equal runs, are omitted.
+    Timings, seed, versions and other entries that do not belong to the results are omitted. A
+    number that is not finite becomes None.
 
     >>> flatten_summary({"scenario": "a", "tracking": {"boom": {"rms": 0.1, "unit": "rad"}}})
     {'tracking.boom.rms': (0.1, 'rad')}
@@ -66,7 +67,7 @@ def _iterate_summary_numbers(part: dict[str, Any], above: str, unit: str | None)
 
 
 def key_unit(key: str) -> str | None:
-    """Return the unit of a scenario key, from its suffix such as `_deg` or a table; None if unknown."""
+    """Return the unit of a scenario key, None if unknown; a suffix such as `_deg` or a table gives it."""
     found = (unit for suffix, unit in KEY_SUFFIXES.items() if key.endswith(suffix))
     return next(found, None) or _UNIT_OF_SCENARIO_KEY.get(key)
 
@@ -80,6 +81,11 @@ def possible_number_names(axes: Iterable[str], teleoperated: bool) -> list[str]:
 
 def check_figures(figures: Iterable[str], possible: list[str], where: str) -> None:
     """Check that every figure is the name of a summary number.
+
+    Args:
+        figures: the names.
+        possible: names of all summary numbers.
+        where: location for the error message.
 
     Raises:
         InputError: a name is unknown; the message lists valid names.
@@ -143,7 +149,7 @@ def execute_task(task: RunTask) -> Outcome:
 
 
 def failed_outcome(run: int, reason: str) -> Outcome:
-    """Return the outcome of a failed run, with the first line of the reason."""
+    """Return the outcome of a failed run, with only the first line of the reason."""
     return Outcome(JournalEntry(run, FAILED, reason.strip().partition("\n")[0]), {}, {})
 
 

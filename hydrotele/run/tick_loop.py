@@ -49,7 +49,7 @@ class TickLoop(NamedTuple):
 def make_tick_loop(
     model: mujoco.MjModel, data: mujoco.MjData, steps: int, every: int, rows: int, period: float
 ) -> TickLoop:  # fmt: skip
-    """Create the record that the compiled loop over control ticks needs.
+    """Create the settings and memory of the compiled loop over control ticks.
 
     Args:
         model: MuJoCo model of the plant.
@@ -104,8 +104,8 @@ def run_teleoperated_ticks(
 ):  # fmt: skip
     """Simulate control ticks of a run in which an operator moves the machine with a joystick.
 
-    The loop stops before the physics of a tick at which Python must process the operator station, for
-    example to check its safety conditions.
+    The loop stops before the physics of a tick at which Python must check safety conditions: every
+    TICKS_PER_CHECK ticks, and when the operator station sets a flag.
 
     Args:
         ticks: `TickLoop.record`, modified.
@@ -137,7 +137,10 @@ def run_teleoperated_ticks(
 
 @compiled
 def _record_row(r, row, contacts, tick):
-    """Write the log row of a control tick, if one is due.
+    """Write the log row of a control tick, if one is due at this tick.
+
+    `r` is the record of the tick loop, `row` that of the log rows and `contacts` that of the
+    contact forces.
 
     Returns:
         False if the row contains a value that is not finite, otherwise True.
@@ -168,7 +171,7 @@ def update_max_pin_opening(ticks):
 
 
 def start_background_compilation() -> None:
-    """Start to compile the tick loop of a teleoperated run in a separate process."""
+    """Start to compile the tick loop of a teleoperated run in a separate process, and return at once."""
     name = compile_tick_loop.__name__
     compile_in_background(run_teleoperated_ticks, f"from {__name__} import {name}; {name}()")
 

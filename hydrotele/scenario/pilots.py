@@ -20,8 +20,9 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 class Pose(StrictModel):
     """Pose of the arm's tip in cylindrical coordinates about the swing axis.
 
-    `r` is the distance from the axis and `z` the height above ground [m]. `theta` is the swing angle,
-    `attitude` the pitch of the tool and `head` its rotation [rad]; not all arms have the last two.
+    `r` is the distance of the tip from the axis and `z` its height above ground [m]. `theta` is the
+    swing angle, `attitude` the pitch of the tool and `head` the rotation of the tool [rad]. Arms
+    without these tool joints leave `attitude` and `head` at None.
     """
 
     r: PositiveFloat
@@ -32,7 +33,10 @@ class Pose(StrictModel):
 
 
 class ConstantPilot(StrictModel):
-    """Constant commands to valves or drives, open loop: axis -> command [1] or [V]."""
+    """Constant open-loop commands to valves or drives.
+
+    `commands` maps axis names to commands [1] or [V]; axes without an entry get the command 0.
+    """
 
     kind: Literal["constant"]
     commands: dict[Name, float] = {}
@@ -42,9 +46,10 @@ class TablePilot(StrictModel):
     """Commands or references from a table over time, given as columns or in a log file.
 
     `quantity: command` drives the valves open loop, `quantity: joint` gives joint references [rad]
-    or [m]. `file` is a CSV or Parquet log, of which the columns `command.<axis>` or
-    `reference.<axis>` (otherwise `angle.<axis>`, `position.<axis>`) are used. `interpolate` holds
-    the last value or connects the values linearly.
+    or [m]. Either `columns` (axis -> values at each `time` [s]) or `file` is given. `file` is a CSV or
+    Parquet log. Its columns `command.<axis>` are used for commands. For joint references its columns
+    `reference.<axis>` are used, or else `angle.<axis>`, or else `position.<axis>`. Between the times,
+    `interpolate: hold` keeps the last value, and `linear` interpolates linearly.
     """
 
     renamed = {"of": "quantity"}
@@ -73,7 +78,10 @@ def _find_nonrising_steps(values) -> list[bool]:
 
 
 def check_size_limit(name: str, amount: float) -> None:
-    """Raise ValueError if an amount exceeds the input limit of that name."""
+    """Raise ValueError if `amount` exceeds the input limit `name`, such as `HARMONICS` or `MOVES`.
+
+    The limits bound the size of user input; `hydrotele.core.files` defines them.
+    """
     if said := describe_excess(name, amount):
         raise ValueError(f"has {said}")
 
@@ -81,7 +89,8 @@ def check_size_limit(name: str, amount: float) -> None:
 class FourierSeries(StrictModel):
     """Fourier series of one joint's reference: `mean + sum_k (sin_k sin(k w t) + cos_k cos(k w t))`.
 
-    k counts from 1, w is 2 pi over the common period, and all coefficients are in [rad] or [m].
+    k counts harmonics from 1, t is time, and w is 2 pi over the period of `FourierPilot` [rad/s]. The
+    constant `mean` and the coefficients in the lists `sin` and `cos` are in [rad] or [m].
     """
 
     mean: float = 0.0
@@ -92,10 +101,9 @@ class FourierSeries(StrictModel):
 class FourierPilot(StrictModel):
     """Periodic joint references as Fourier series with a common `period` [s].
 
-    They are faded in from the start position over `fade` [s].
-
-    The servo holds axes without a reference at their start, except those in `closed_valves`, whose
-    command is always 0.
+    `axes` maps axis names to series. Over the first `fade` seconds the reference changes smoothly from
+    the start position to the series. The servo holds axes without a series at their start position,
+    except those in `closed_valves`, whose valve command is always 0.
     """
 
     kind: Literal["fourier"]
@@ -116,7 +124,9 @@ class FourierPilot(StrictModel):
 class TipMove(StrictModel):
     """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad].
 
-    `speed` is that of the tip [m/s], or [rad/s] if only angles change; `pause` [s] follows the move.
+    All distances are relative to the pose before the move. `speed` is the speed of the tip in r and z
+    [m/s], or of the angle that changes most [rad/s] if r and z do not change. The tip rests for
+    `pause` [s] after the move.
     """
 
     r: float = 0.0
@@ -131,9 +141,10 @@ class TipMove(StrictModel):
 class LinesPilot(StrictModel):
     """Straight moves of the tip in cylindrical coordinates, converted to joint references.
 
-    `mode: rate` integrates rate commands like those of a joystick under rate control; `position`
-    commands the pose. The tip rests for `settle` [s] and then makes the `moves`, whose speeds are
-    reached with `acceleration` [m/s^2] or [rad/s^2].
+    `mode: rate` integrates rate commands like those of a joystick under rate control; `mode: position`
+    solves the joint references from the commanded pose. The tip first rests for `settle` [s] and then
+    makes the `moves` one after the other. Each move accelerates to its speed and decelerates with
+    `acceleration` [m/s^2] or [rad/s^2].
     """
 
     kind: Literal["lines"]
@@ -149,9 +160,10 @@ class LinesPilot(StrictModel):
 
 
 class Waypoint(StrictModel):
-    """Joint positions or tip pose, reached `duration` [s] after the previous one, held `pause` [s].
+    """Target of a motion: joint positions or a tip pose.
 
-    `joints` are joint name -> position [rad] or [m].
+    The motion from the previous waypoint takes `duration` [s]. The target is then held for `pause`
+    [s]. `joints` maps joint names to positions [rad] or [m].
     """
 
     duration: PositiveFloat
@@ -163,7 +175,8 @@ class Waypoint(StrictModel):
 class WaypointsPilot(StrictModel):
     """Waypoints connected by quintic polynomials of time, in joint space or in the tip pose.
 
-    The motion starts after `settle` [s].
+    A waypoint with `pose` is reached along a path of tip poses, one with `joints` in joint space. The
+    machine holds its start position for the first `settle` seconds.
     """
 
     kind: Literal["waypoints"]

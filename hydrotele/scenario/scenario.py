@@ -33,7 +33,7 @@ from hydrotele.scenario.surrounding_objects import SurroundingObject
 class StartState(StrictModel):
     """Start of a run: joint positions by joint name [rad] or [m], or a tip pose.
 
-    Joints that are not given start at the machine's home position.
+    Joints for which nothing is given start at their positions in the machine's home position.
     """
 
     joints: dict[Name, float] = {}
@@ -43,14 +43,16 @@ class StartState(StrictModel):
 class Servo(StrictModel):
     """Settings of the servo that moves every joint along its reference.
 
-    `position_gain` [1/s] is the velocity command per position error; `axis_gains` [1/s] replace it for
-    individual axes (such as a slewing house); `velocity_gain` (force drives only) [N s/m] or
-    [N m s/rad]; `feedforward` of the reference velocity and `deadband_compensation` of the valves, as
-    fractions; `lead` [s], a phase lead that compensates the spool lag;
-    `pressure_feedback` [1/s], which adds damping, with the time constant `load_time` [s] of the
-    low-pass filtered drive force. `force_model` replaces the filtered force by inverse dynamics
-    along the reference, of the machine of the scenario (`nominal`) or of another machine (its name
-    or folder).
+    - `position_gain` [1/s]: velocity command per position error. `axis_gains` [1/s] maps axis names to
+      gains that replace it, such as for the swing.
+    - `velocity_gain` [N s/m] or [N m s/rad]: force per velocity error, for force drives only.
+    - `feedforward` [1]: fraction of the reference velocity that is fed forward.
+    - `deadband_compensation` [1]: fraction of the valves' dead band that is compensated.
+    - `lead` [s]: the reference velocity is taken this much later than now, to compensate spool lag.
+    - `pressure_feedback` [1/s]: gain of the drive force minus its low-pass filtered value; it adds
+      damping. `load_time` [s] is the time constant of this low-pass filter.
+    - `force_model`: if given, inverse dynamics along the reference replace the filtered force. They are
+      those of the scenario's machine (`nominal`) or of another machine (its name or folder).
     """
 
     position_gain: NonNegativeFloat = 4.0
@@ -65,10 +67,10 @@ class Servo(StrictModel):
 
 
 class PlantedEffect(StrictModel):
-    """An effect of the simulated machine that is not in its nominal model, such as a leakage.
+    """An effect that is added to the simulated machine but is not in its nominal model, such as a leakage.
 
-    `location` is the axis or part, and `parameters` are those of the effect. `hydrotele list effects`
-    lists the names.
+    `name` is the kind of effect; `hydrotele list effects` lists all names. `location` is the axis or
+    part of the machine that has the effect. `parameters` maps the effect's parameter names to values.
     """
 
     name: str
@@ -79,9 +81,10 @@ class PlantedEffect(StrictModel):
 class Scenario(StrictModel):
     """Complete specification of one simulated run; the same scenario gives bit-identical results.
 
-    `timestep` [s] is that of the physics, `control_rate` and `log_rate` [Hz] are the rates of
-    controller and log, and `seed` that of all random numbers. `sensors` names a sensor set of the
-    machine.
+    `duration` [s] is that of the run, `timestep` [s] that of the physics. `control_rate` and `log_rate`
+    [Hz] are the rates of controller and log, and `seed` is the seed of all random numbers. `sensors`
+    names a sensor set of the machine, and `tool` one of the machine's tools. `folder` is the folder of
+    the scenario file, which is set automatically; relative paths in the scenario start there.
     """
 
     name: Name
@@ -132,17 +135,19 @@ class Scenario(StrictModel):
 
     @property
     def row_count(self) -> int:
-        """Number of log rows of the run."""
+        """Number of log rows of the run: control periods over control periods per row, rounded down."""
         return self.tick_count // round(self.control_rate / self.log_rate)
 
 
 def shipped_scenarios() -> list[str]:
-    """Return the sorted names of the scenario files that the package contains."""
+    """Return the sorted names of the scenarios that the package contains: file names without `.yaml`."""
     return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
 
 
 def find_scenario(name_or_path: str | Path) -> Path:
-    """Return the file of a shipped scenario, given by name, or of the user's scenario file.
+    """Return the path of the file of a shipped scenario, given by name, or of the user's scenario file.
+
+    A shipped scenario takes precedence over a file of the same name.
 
     Raises:
         InputError: the scenario does not exist; the message lists the shipped ones.
@@ -163,8 +168,9 @@ class ScenarioFile(NamedTuple):
 
     Attributes:
         path: the file.
-        data: its keys and values.
-        lines: key path, a tuple such as `("pilot", "file")` -> line number, starting at 1.
+        data: keys and values of the file.
+        lines: key path -> line number, starting at 1. A key path is a tuple such as
+            `("pilot", "file")`.
     """
 
     path: Path
@@ -173,9 +179,9 @@ class ScenarioFile(NamedTuple):
 
 
 def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
-    """Read a shipped or own scenario file without validation.
+    """Read the scenario file of a shipped scenario or of the user, without validation of its values.
 
-    `make_scenario` can make several scenarios from the result, each with its own overrides.
+    `make_scenario` can make several scenarios from the result, each with other values replaced.
 
     Raises:
         InputError: the scenario does not exist, or the file is not a YAML mapping.
@@ -185,7 +191,7 @@ def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
 
 
 def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
-    """Read a scenario from a shipped or own YAML file, replace given values, and validate it.
+    """Read a scenario from a shipped or the user's YAML file, replace given values, and validate the result.
 
     Args:
         name_or_path: name of a shipped scenario or path of a YAML file.
@@ -201,10 +207,11 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
 
 
 def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
-    """Validate the content of a scenario file, after replacing values.
+    """Return the validated scenario of a scenario file, after replacing given values.
 
-    `overrides` maps dotted key paths to YAML text, such as `servo.position_gain` to `2`. The file of a
-    table pilot is read into the scenario.
+    `overrides` maps dotted key paths to YAML text, such as `servo.position_gain` to `2`. `file` is not
+    changed. If the pilot is a table in a log file, that log is read and its columns are stored in the
+    scenario.
 
     Raises:
         InputError: the file is not valid; the message names file, line, key path and valid values.
@@ -229,11 +236,13 @@ def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
 
 
 def _load_pilot_table(scenario: Scenario, where: str) -> Scenario:
-    """Replace the log file of a pilot that follows a table by its columns.
+    """Return a scenario in which the log file of a table pilot is replaced by the log's columns.
 
-    The scenario is then self-contained.
+    Times then count from the first row of the log. A scenario with another pilot or without such a
+    file is returned unchanged. `where` names file, line and key in error messages.
 
-    `where` names file, line and key in error messages. Raise InputError for an unsuitable log.
+    Raises:
+        InputError: the log cannot be read, or has no column of the pilot's quantity.
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TablePilot) or pilot.file is None:
@@ -256,9 +265,10 @@ def _load_pilot_table(scenario: Scenario, where: str) -> Scenario:
 
 
 def find_local_machine(scenario: Scenario) -> Path | None:
-    """Return the path of a scenario's own machine, or None if its machine is a shipped one.
+    """Return the path of the user's machine that a scenario names, or None if there is none at that path.
 
-    An own machine is a file or folder relative to the folder of the scenario file.
+    The path is relative to the folder of the scenario file: a machine file, or a folder that contains
+    `machine.yaml`. Without such a file, the scenario's machine is a shipped one.
     """
     path = Path(scenario.folder, scenario.machine)
     beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
@@ -266,7 +276,11 @@ def find_local_machine(scenario: Scenario) -> Path | None:
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
-    """Write a scenario with all its values, defaults included, as YAML that `load_scenario` can read."""
+    """Write a scenario with all its values, defaults included, as YAML that `load_scenario` can read.
+
+    The path of a user's machine is written with the scenario's folder, so that it does not depend on
+    the folder of `path`. The key `folder` is not written.
+    """
     data = scenario.model_dump(mode="json")
     beside = find_local_machine(scenario)
     data["machine"] = str(beside) if beside else scenario.machine

@@ -17,11 +17,11 @@ from hydrotele.logs.log import Log
 
 
 class Plate(StrictModel):
-    """A plate on a spring and a damper that the tool can press: an environment of known stiffness.
+    """A plate on a spring and a damper that the tool can press against: an environment of known stiffness.
 
     `position` [m] is the centre of its face and `normal` the outward normal of the face (z is up,
-    -x points back to the machine). `size` holds the half sizes [m]; further keys are mass [kg],
-    stiffness [N/m] and damping [N s/m].
+    -x points back to the machine). `size` holds the two half sizes of the face [m]. `mass` [kg] is that
+    of the plate; `stiffness` [N/m] and `damping` [N s/m] are those of its spring and damper.
     """
 
     kind: Literal["plate"] = "plate"
@@ -36,9 +36,11 @@ class Plate(StrictModel):
 class StandingTree(StrictModel):
     """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
 
-    `position` [m] is on the ground, `cut_height` [m] the height of the cut, and
-    `cutting_energy` [J/m^3] the energy per cut volume. `saw` and `grab` are axes of the machine; a
-    grab at more than `closed_angle` [rad] holds a stem in its pocket.
+    `position` [m] is the point (x, y) on the ground where the tree stands. `diameter` and `height` [m]
+    and `density` [kg/m^3] are those of the stem. `cut_height` [m] is the height of the cut above
+    ground, and `cutting_energy` [J/m^3] the energy per cut volume. `saw` and `grab` name the machine
+    axes of disc saw and grab arm. A grab angle above `closed_angle` [rad] holds a stem that is in the
+    grab's pocket.
     """
 
     renamed = {"kerf": "cut_height", "energy": "cutting_energy", "closed": "closed_angle"}
@@ -58,10 +60,10 @@ class StandingTree(StrictModel):
 class LogOnGround(StrictModel):
     """A log on the ground that a grapple picks up and puts down.
 
-    `position` [m] is its centre, and `direction` [rad] the angle of its axis in the horizontal
-    plane, 0 along x; diameter and length are in [m], density in [kg/m^3]. `grab` is the axis of the
-    machine that closes the jaw. A log in the pocket is gripped at more than `closed_angle` [rad]
-    and released at less than `open_angle` [rad].
+    `position` [m] is the point (x, y) of the log's centre, and `direction` [rad] the angle of the log's
+    axis in the horizontal plane, 0 along x. `diameter` and `length` are in [m], `density` in [kg/m^3].
+    `grab` is the axis of the machine that closes the jaw. A log in the grapple's pocket is gripped at
+    a jaw angle above `closed_angle` [rad] and released below `open_angle` [rad].
     """
 
     renamed = {"closed": "closed_angle", "open": "open_angle"}
@@ -95,8 +97,8 @@ class LogOnGround(StrictModel):
 class SoilGround(StrictModel):
     """Ground that the bucket of the machine can dig up: a strip of soil in the plane of the arm.
 
-    `soil` selects the soil's strength parameters by name. Other links of the machine touch firm
-    ground.
+    `soil` selects the soil's strength parameters by name. For all other links of the machine the
+    ground is firm.
     """
 
     kind: Literal["soil"] = "soil"
@@ -107,12 +109,12 @@ SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround, F
 
 
 def read_soil_from_log(log: Log) -> tuple[SoilGround, ...]:
-    """Read from a log's metadata the soil that the bucket could dig during the run.
+    """Return the soil that the bucket could dig in a logged run, as stored in the log's metadata.
 
-    The result contains one soil, or is empty if the run had none.
+    The result is a tuple of one soil, or an empty tuple if the run had no soil.
 
     Raises:
-        InputError: the metadata are damaged.
+        InputError: the log's soil metadata are not valid.
     """
     if "soil" not in log.metadata:
         return ()

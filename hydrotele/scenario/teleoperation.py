@@ -27,10 +27,10 @@ _DEFAULT_AXES: dict[str, tuple[str, float]] = {
 class CoordinateMapping(StrictModel):
     """Mapping from the joystick to one task coordinate.
 
-    Under rate control, the handle at its stop commands `speed` [m/s] or [rad/s]. Under position
-    control, the coordinate moves `scale` times as far as the handle ([m/m], [rad/rad]; theta by
-    translation [rad/m]), at most at `speed`. `axis` and `sign` select the joystick axis and its
-    direction.
+    Under rate control, the handle at its stop commands the rate `speed` [m/s] or [rad/s]. Under
+    position control, the coordinate moves `scale` times as far as the handle ([m/m], [rad/rad]; theta
+    is moved by a translation of the handle, [rad/m]), with at most `speed`. `axis` selects the
+    joystick axis that moves the coordinate, and `sign` the direction.
     """
 
     axis: JoystickAxis | None = None
@@ -41,7 +41,8 @@ class CoordinateMapping(StrictModel):
     def resolve_axis(self, coordinate: str) -> tuple[str, float]:
         """Return the joystick axis that moves a coordinate, and the sign (+1 or -1) of its direction.
 
-        Values that are not given are the defaults of the coordinate.
+        If `axis` or `sign` is not set, the default of the coordinate is returned: x for r, y for theta,
+        z for z, ry with sign -1 for attitude, and rx for head.
         """
         axis, sign = _DEFAULT_AXES[coordinate]
         return self.axis or axis, float(self.sign or sign)
@@ -50,12 +51,13 @@ class CoordinateMapping(StrictModel):
 class Channel(StrictModel):
     """Communication channel between operator and machine, with delays and packet loss.
 
-    `delay_forward` and `delay_back` [s] are rounded to whole control periods; one packet is sent
-    per period. From `loss_start` [s] on, every packet is lost with the probability
-    `loss_probability`. Every packet has an additional, exponentially distributed delay with the
-    mean `jitter` [s]; overtaken packets are discarded. `trace` is a CSV file of measured delays
-    with the columns `forward` and `back` [s] and one row per packet, empty for a lost packet. It
-    repeats if the run is longer, and replaces delays and jitter.
+    One packet is sent per control period in each direction. `delay_forward` (operator to machine) and
+    `delay_back` (machine to operator) [s] are rounded to whole control periods. Every packet has an
+    additional, exponentially distributed delay with the mean `jitter` [s]; a packet that arrives
+    after a later one is discarded. From the time `loss_start` [s] on, every packet is lost with the
+    probability `loss_probability`. `trace` is a CSV file of measured delays that replace these delays
+    and the jitter. It has the columns `forward` and `back` [s] and one row per packet, empty for a
+    lost packet. The trace repeats if the run is longer than it.
     """
 
     renamed = {"lost": "loss_probability", "lost_from": "loss_start"}
@@ -77,9 +79,10 @@ class Channel(StrictModel):
 class SafetyLimits(StrictModel):
     """Conditions under which the machine stops automatically.
 
-    Without a new packet for `packet_timeout` [s], the rates go to zero and the reflected force
+    Without a new packet for `packet_timeout` [s], the commanded rates go to zero and the reflected force
     fades out. The valves close permanently if a joint is further than `following_error` [rad] or
-    [m] from its reference, or if a noisy sensor gives the same value for `frozen_time` [s].
+    [m] from its reference. They also close permanently if the readings of a sensor, which normally
+    vary by noise, stay the same for `frozen_time` [s].
     """
 
     renamed = {"silence": "packet_timeout", "frozen": "frozen_time"}
@@ -90,12 +93,13 @@ class SafetyLimits(StrictModel):
 
 
 class TipOver(StrictModel):
-    """Tip-over protection: push the joystick back above `moment_fraction` of the tipping moment.
+    """Tip-over protection: a force on the joystick's vertical axis that pushes the handle to its centre.
 
-    The machine of `mass` [kg] has its centre of mass at `centre_of_mass_behind` [m] behind the
-    swing axis. It tips about the edge of its tracks, `tipping_edge` [m] in front of or behind the
-    axis. The reaction is that of a spring with `stiffness` [N/m] and a damper with `damping`
-    [N s/m].
+    The force acts if the contact force at the tip causes more than the fraction `moment_fraction` of
+    the moment that tips the machine. The machine of `mass` [kg] has its centre of mass at
+    `centre_of_mass_behind` [m] behind the swing axis. It tips about the edge of its tracks,
+    `tipping_edge` [m] in front of or behind the axis. The force on the handle is that of a spring with
+    `stiffness` [N/m] and a damper with `damping` [N s/m].
     """
 
     renamed = {
@@ -113,7 +117,7 @@ class TipOver(StrictModel):
 class SensorFault(StrictModel):
     """Sensor fault: from the time `start` [s] on, a sensor repeats its last reading.
 
-    `channel` names the sensor, such as `angle.boom` or `pressure_rod.stick`.
+    `channel` is the log channel of the sensor, such as `angle.boom` or `pressure_rod.stick`.
     """
 
     renamed = {"at": "start"}
@@ -123,9 +127,10 @@ class SensorFault(StrictModel):
 
 
 class ButtonCommand(StrictModel):
-    """Command of an axis that the joystick does not move (saw, grab), from `start` [s] on.
+    """Open-loop command that a joystick button gives to an axis that the joystick does not move.
 
-    `command` is that of the valve or drive [1] or [V].
+    Such an axis is a saw or a grab. From the time `start` [s] on, until the next button command of the
+    axis, its valve or drive gets `command` [1] or [V].
     """
 
     renamed = {"at": "start"}
@@ -144,7 +149,8 @@ def _check_time_points(time: list[float]) -> None:
 class FollowPath(StrictModel):
     """The operator moves the handle along a given path.
 
-    `path` gives the displacements of the joystick axes [m] or [rad] at each `time` [s].
+    `path` maps joystick axes to their displacements from the centre [m] or [rad] at each `time` [s].
+    Between the times, `interpolate: hold` keeps the last value, and `linear` interpolates linearly.
     """
 
     kind: Literal["follow"]
@@ -162,7 +168,7 @@ class FollowPath(StrictModel):
 
 
 class ForceTarget(StrictModel):
-    """Reference contact force along a coordinate: `force` [N] at `time` [s].
+    """Target of the contact force along one task coordinate over time: `force` [N] at each `time` [s].
 
     The force is positive if the environment pushes the machine along the coordinate.
     """
@@ -180,11 +186,12 @@ class ForceTarget(StrictModel):
 
 
 class RegulateForce(StrictModel):
-    """The operator regulates a contact force to its target by the reflected force alone.
+    """The operator regulates a contact force to its target by feel, with the reflected force alone.
 
-    The operator knows how the joystick displays a contact force to the hand: by its nominal stiffness
-    and stiffness per force, or by the ratio of direct reflection. The operator corrects the force by
-    pushes of the handle. `approach` is the handle displacement before contact, as a fraction of its
+    The operator knows how the joystick displays a contact force to the hand: with stiffness reflection,
+    the joystick's nominal stiffness and its change per contact force; with direct reflection, the ratio
+    of hand force to contact force. The operator corrects the force by pushes of the
+    handle. Before contact the operator deflects the handle by `approach`, a fraction of the handle's
     range beyond the dead band.
     """
 
@@ -194,11 +201,12 @@ class RegulateForce(StrictModel):
 
 
 class TrackForce(StrictModel):
-    """The operator tracks a displayed force trajectory, seen with delay and noise.
+    """The operator makes the contact force follow a target force that a screen displays.
 
-    `display: both` shows the target and the contact force from the machine's sensors. `target`
-    shows the target alone, so that the operator has to feel or to estimate the force. `approach` is
-    the handle displacement before contact, as a fraction of its range beyond the dead band.
+    The operator sees the screen with delay and noise. `display: both` shows the target and the contact
+    force from the machine's sensors. `display: target` shows the target alone, so that the operator has
+    to feel or to estimate the contact force. Before contact the operator deflects the handle by
+    `approach`, a fraction of the handle's range beyond the dead band.
     """
 
     kind: Literal["track"]
@@ -210,8 +218,8 @@ class TrackForce(StrictModel):
 class SteerToPoses(StrictModel):
     """The operator steers the tip by sight to one pose after the other.
 
-    `points` gives the values of every coordinate (r, z [m], theta, attitude, head [rad]), each of
-    which applies from its `time` [s] on.
+    `points` maps task coordinates (r, z [m]; theta, attitude, head [rad]) to one goal value per entry of
+    `time`. Each goal applies from its `time` [s] on, until the next one.
     """
 
     kind: Literal["steer"]
@@ -236,8 +244,8 @@ class LiveOperator(StrictModel):
 class RecordedMotion(StrictModel):
     """The handle repeats the recorded motion of a person; `recorded` is a CSV or Parquet file.
 
-    Its columns are `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), displacements in [m] or
-    [rad]. A column name may contain a unit (`handle.z [mm]`). Axes without a column stay centred.
+    The file's columns are `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), displacements in [m] or
+    [rad]. A column name may contain a unit (`handle.z [mm]`). Joystick axes without a column stay centred.
     """
 
     kind: Literal["recorded"] = "recorded"
@@ -259,11 +267,11 @@ RENAMED_OPERATOR_PARAMETERS = {
 class OperatorSettings(StrictModel):
     """Parameters of the simulated operator: perception, neuromuscular dynamics and arm impedance.
 
-    `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. `sample`
-    selects a random operator, with that number, from the distributions in the file. `grip`
-    (relaxed, normal, firm) replaces the arm impedance of the joystick file; `posture` (near, mid,
-    far) adds the stiffness ellipses of an arm. Parameters that are set here replace those of the
-    file:
+    `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. If the number
+    `sample` is given, a random operator is drawn from the distributions in the file, with this number
+    as seed. `grip` (relaxed, normal, firm) replaces the arm impedance of the joystick file; `posture`
+    (near, mid, far) adds the stiffness ellipses of an arm. Parameters that are set here replace those
+    of the file:
 
     visual_delay: delay from vision to action [s]; haptic_delay: delay from haptic perception to
     action [s]; max_crossover_frequency: maximum crossover frequency of loops that the operator
@@ -272,10 +280,10 @@ class OperatorSettings(StrictModel):
     operator's observations; visual_threshold: visual resolution of a position [m] or [rad];
     display_noise: noise of a displayed force, as a fraction of its maximum; tremor: noise of the
     muscle force [N]; handle_position_gain: gain of the position control of the handle [1/s];
-    cocontraction: fraction of the maximum; unfelt_gain_std: relative standard deviation of the
-    expected effect of a command without force feedback; task_stiffness: stiffness that the operator
-    is used to [N/m]; correction_interval: time between corrective pushes [s]. `Operator` in
-    `hydrotele.teleop.operator_parameters` documents all of them.
+    cocontraction: muscle cocontraction as a fraction of its maximum; unfelt_gain_std: relative
+    standard deviation of the expected effect of a command without force feedback; task_stiffness:
+    stiffness that the operator is used to [N/m]; correction_interval: time between corrective pushes
+    [s]. `Operator` in `hydrotele.teleop.operator_parameters` documents all of them.
     """
 
     renamed = {"drawn": "sample"} | RENAMED_OPERATOR_PARAMETERS
@@ -344,7 +352,8 @@ class TeleopPilot(StrictModel):
     machine force limited to `force_limit` [N]. `coupling` [N/m] is the spring between handle and
     slave of coordinating force and four channels: per metre of the handle under position control
     (default 400), of the machine under rate control (default 40). `coupling_damping` [N s/m]
-    defaults to a tenth of it. `virtual_mass` [kg] is the slave mass of four channels.
+    defaults to 0.1 s times `coupling`. `virtual_mass` [kg] is the slave mass of four
+    channels, wave variables and passivity control.
     `acceleration` [m/s^2] or [rad/s^2] limits the references. `force` selects the source of the
     contact force: the pressures with the `static` or `dynamic` model, through a filter with
     `bandwidth` [rad/s] (`bandwidth_hz`), or the exact force of the simulator (`true`).

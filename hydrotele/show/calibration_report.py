@@ -105,7 +105,10 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
 
 
 def draw_linkage_errors(fit: LinkageFit) -> bytes:
-    """Draw the error of the piston displacement [mm] of a fitted linkage over the joint angle as PNG."""
+    """Draw the errors of the piston displacement [mm] of a fitted linkage over the joint angle as PNG.
+
+    All samples are shown, fitted and held-out ones.
+    """
     with open_report_figure(2.4) as figure:
         place = figure.subplots()
         place.plot(np.degrees(fit.angle), 1e3 * fit.residual, ".", ms=2, color="#1769aa")
@@ -115,10 +118,14 @@ def draw_linkage_errors(fit: LinkageFit) -> bytes:
 
 
 def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
-    """Draw figures of merit of calibrator designs as PNG: maps over the two link lengths.
+    """Draw three maps of calibrator designs over the two link lengths, arm and forearm, as PNG.
 
     The maps show the tip error of the calibrated arm, the information on its parameters and the
-    fraction of reached poses. The present and the best design are marked.
+    fraction of poses that the calibrator reaches. The present and the best design are marked.
+
+    Args:
+        survey: designs on the grid of link lengths, and the present design.
+        best: best design.
     """
     shape = len(FOREARM_LENGTHS), len(ARM_LENGTHS)
     tip = np.array([d.tip_error for d in survey.designs]).reshape(shape)
@@ -155,10 +162,11 @@ _CONTOUR_PROBABILITIES = (
 
 
 def draw_pose_errors(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], description: str) -> bytes:
-    """Draw the errors of each pose before and after calibration on a logarithmic scale.
+    """Draw the errors of each pose before and after calibration as bars on a logarithmic scale.
 
     Args:
-        errors: {title with unit: (errors before (n,), errors after (n,))}, in the unit of the title.
+        errors: {title with unit: (errors before (n,), errors after (n,))}, in the unit of the
+            title.
         description: description of the poses, such as `held-out poses`.
 
     Returns:
@@ -249,10 +257,11 @@ NOMINAL_POINTS_COLOUR, CALIBRATED_POINTS_COLOUR = "#e07b00", "#1769aa"
 
 
 def draw_socket_errors(calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction]) -> bytes:
-    """Draw errors of a robot calibration with ball and sockets, before and after.
+    """Draw errors of a robot calibration with ball and sockets, for the nominal and the calibrated robot.
 
-    The upper plot shows the distance of the predicted ball from its mean position in the socket, the
-    lower one the distances of neighbouring sockets.
+    The upper plot shows the distance of the predicted ball from its mean position in the socket,
+    for both robots. The lower plot shows the distances of neighbouring sockets by the calibrated
+    robot.
 
     Args:
         calibration: result of the calibration.

@@ -86,7 +86,7 @@ class Trace(NamedTuple):
 
     @property
     def legend_name(self) -> str:
-        """Name in a legend: the axis, or `supply`."""
+        """Name in a legend: the axis, or `supply` for a channel without an axis."""
         return self.channel.axis or "supply"
 
 
@@ -163,10 +163,12 @@ def compute_channel_difference(first: Log, other: Log, name: str) -> tuple[np.nd
 
 
 def padded_range(values: Iterable[np.ndarray], unit: str) -> tuple[float, float]:
-    """Return limits of a plot axis with a margin around all values and a minimum range.
+    """Return limits of a plot axis that contain all values, with a margin of 5 % on both sides.
+
+    The range has a minimum that depends on the unit, so that noise does not fill the plot.
 
     Args:
-        values: arrays [unit].
+        values: arrays [unit]; NaN and infinity are ignored.
         unit: unit of the plot.
 
     Returns:

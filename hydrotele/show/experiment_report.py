@@ -55,7 +55,8 @@ def write_experiment_report(
     Args:
         title: title of the publication.
         rows: comparisons of published and simulated results.
-        items_without_result: {table or figure of the publication: reason why it has no result to compare}.
+        items_without_result: {table or figure of the publication without a result to compare: its
+            content, such as `photograph`}.
         folder: existing output folder.
     """
     figures = draw_figures(rows)
@@ -78,7 +79,11 @@ def write_experiment_report(
 
 
 def draw_figures(rows: Sequence[Comparison]) -> list[ReportFigure]:
-    """Draw the figures of all comparisons: curves and posterior samples, numbered consecutively."""
+    """Draw the figures of all comparisons of published and simulated results, numbered consecutively.
+
+    A comparison has up to two figures: curves, and samples of a posterior. Comparisons with neither
+    have none.
+    """
     figures = []
     for row in rows:
         slug = re.sub(r"[^a-z0-9]+", "-", row.name.lower()).strip("-")
@@ -106,7 +111,7 @@ def _describe_panels(panels: Sequence[Panel]) -> str:
 
 
 def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
-    """Draw panels of curves below each other, with a further panel for the errors of each.
+    """Draw panels of curves below each other; a panel with errors is followed by a panel of its errors.
 
     The panels share their x axis if they have the same x quantity.
 

@@ -44,7 +44,13 @@ _BALANCES = {"force": "force", "flow": "flow", "length": "cylinder length"}
 
 
 def regression_content(gap: Gap) -> dict[str, Any] | None:
-    """Return sentences, table rows and a picture of the initial regressions; None if there are none."""
+    """Return the content of the report section on the initial regressions; None if there are none.
+
+    Returns:
+        `errors`: description and probability of each gross error of the log or machine file.
+        `rows`: table rows of the coefficients. `picture`: PNG of the force and flow regressions,
+        None without them.
+    """
     found = gap.initial
     if found is None or not (found.regressions or found.errors):
         return None
@@ -57,7 +63,12 @@ def regression_content(gap: Gap) -> dict[str, Any] | None:
 
 
 def _regression_rows(one: Regression) -> list[tuple[str, ...]]:
-    """Return table rows: balance, coefficient, given, estimate, interval, unit, explained variance given and fitted."""
+    """Return the table rows of one regression, one row per coefficient.
+
+    A row contains, as texts, balance and drive, coefficient, value of the given machine, estimate,
+    95 % interval, unit, and the variance that the given machine and the fit explain. Balance, drive
+    and variances are stated in the first row only.
+    """
     rows = []
     for name, estimate in one.coefficients.items():
         if name == "constant" and one.balance != "force":
@@ -73,7 +84,10 @@ def _regression_rows(one: Regression) -> list[tuple[str, ...]]:
 
 
 def _plain_texts(estimate: Estimate) -> tuple[str, str, str, str]:
-    """Return given value, estimate, interval and unit; ratios stay ratios."""
+    """Return texts of given value, estimate, interval and unit of an estimate, in customary units.
+
+    A number without unit is shown as a ratio, not in per cent, and its unit is "".
+    """
     if estimate.unit == "1":
         given = f"{estimate.nominal:.3g}" if math.isfinite(estimate.nominal) else "-"
         return given, f"{estimate.value:.4g}", f"{estimate.low:.4g} to {estimate.high:.4g}", ""
@@ -86,10 +100,13 @@ def _variance_text(fraction: float) -> str:
 
 
 def draw_regressions(regressions: list[Regression], machine: Machine) -> bytes:
-    """Draw a row per drive: friction over velocity, force over position, and flow over that of the model.
+    """Draw measured points and fitted lines of the initial regressions, with one row of plots per drive.
+
+    The plots of a row show friction over velocity, force without load and friction over position,
+    and measured flow over the valve flow of the model or, if that is unknown, over the command.
 
     Args:
-        regressions: of forces and flows.
+        regressions: regressions of forces and flows.
         machine: the given machine.
 
     Returns:
@@ -121,7 +138,16 @@ def draw_regressions(regressions: list[Regression], machine: Machine) -> bytes:
 
 
 def _parts(one: Regression, machine: Machine) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return friction (k,) by the fit, force per position (k,) by the fit, and the constant [N] or [N m]."""
+    """Return three terms of a fitted force regression at its k points.
+
+    Args:
+        one: regression of the force of a drive.
+        machine: the given machine, which states the smoothing velocity of the friction.
+
+    Returns:
+        Viscous and Coulomb friction (k,), position-dependent force (k,), which is 0 at the mean
+        position, and the constant force; all in [N] or [N m].
+    """
     c, smooth = one.coefficients, machine.axes[one.axis].drive.friction.smoothing_velocity
     speed, position = one.points["velocity"], one.points["position"]
     friction = c["viscous"].value * speed + c["coulomb"].value * np.tanh(speed / smooth)
@@ -129,7 +155,11 @@ def _parts(one: Regression, machine: Machine) -> tuple[np.ndarray, np.ndarray, f
 
 
 def _draw_friction(axes: "Axes", one: Regression, machine: Machine) -> None:
-    """Draw what remains of the measured force without the model's load, over velocity."""
+    """Draw the measured force minus the fitted load and position-dependent terms, over velocity.
+
+    The lines are the friction of the given machine and the fitted friction plus constant. The load
+    is the force that the model computes, times the fitted factor.
+    """
     c, drive = one.coefficients, machine.axes[one.axis].drive.friction
     _, slope, _ = _parts(one, machine)
     force = one.points["measured"] - c["factor"].value * one.points["model"] - slope
@@ -147,7 +177,11 @@ def _draw_friction(axes: "Axes", one: Regression, machine: Machine) -> None:
 
 
 def _draw_position(axes: "Axes", one: Regression, machine: Machine) -> None:
-    """Draw what remains of the measured force without the model's load and friction, over position."""
+    """Draw the measured force minus the fitted load and friction, over position.
+
+    The lines are 0 (the given machine) and the fitted constant plus position-dependent force. The
+    load is the force that the model computes, times the fitted factor.
+    """
     friction, _, constant = _parts(one, machine)
     rest = one.points["measured"] - one.coefficients["factor"].value * one.points["model"] - friction
     position = one.points["position"]
@@ -162,7 +196,11 @@ def _draw_position(axes: "Axes", one: Regression, machine: Machine) -> None:
 
 
 def _draw_flow(axes: "Axes", one: Regression, machine: Machine) -> None:
-    """Draw the measured flow over that of the model, or over the command."""
+    """Draw the measured flow over the valve flow of the model, with the lines of given and fitted model.
+
+    If the given machine does not determine the valve flow, the measured flow is drawn over the
+    command, without a line of the given model.
+    """
     factor, constant = (one.coefficients[n].value for n in ("factor", "constant"))
     is_nominal = math.isfinite(one.coefficients["factor"].nominal)
     unit, scale = plot_axis_unit(one.unit)
@@ -192,7 +230,14 @@ def _draw(axes: "Axes", x, measured, line, given, fitted) -> None:
 
 
 def why_content(gap: Gap) -> dict[str, Any] | None:
-    """Return sentences, tables and a picture that explain the verdict; None without an explanation."""
+    """Return sentences, tables and a picture that explain the verdict; None without an explanation.
+
+    Returns:
+        `reasons`: sentences. `candidates`, `levels`, `rejected`, `inputs`: table rows of the candidate
+        effects, of location, family and law of each named effect, of the rejected effects and of the
+        residual inputs. `run`: run of the residual inputs. `picture`: PNG of the residual inputs over
+        time, None without them.
+    """
     why = gap.explanation
     if why is None:
         return None
@@ -208,7 +253,12 @@ def why_content(gap: Gap) -> dict[str, Any] | None:
 
 
 def verdict_reasons(gap: Gap) -> list[str]:
-    """Return sentences that derive the verdict, each with the number that it rests on."""
+    """Return sentences that give the reasons of the verdict, each with its number.
+
+    They state the Bayes factors of the named effects and of their best competitors, probabilities
+    that are too low, residual tests that failed (or that all passed), and fractions of the gap that
+    learned laws close. They also state if the prediction error of a perfect model is not known.
+    """
     texts = []
     for comparison in gap.explanation.comparisons if gap.explanation else ():
         own = next(c for c in comparison.contenders if (c.name, c.location) == (comparison.name, comparison.location))
@@ -246,7 +296,12 @@ def _title(effect: Any) -> str:
 
 
 def _candidate_rows(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return table rows of the candidates that could replace an effect, and of none."""
+    """Return table rows of the candidate effects that compete for one part of the gap.
+
+    A row has title, twice the log Bayes factor against no effect, probability, relative size of the
+    factor (1 for the largest), and whether the candidate is the named effect. The last row has the
+    probability that none of them is right.
+    """
     best = max((c.log_bayes_factor for c in comparison.contenders), default=1.0)
     rows = [
         {
@@ -262,7 +317,11 @@ def _candidate_rows(comparison: Comparison) -> list[dict[str, Any]]:
 
 
 def _level_rows(gap: Gap) -> list[tuple[str, str, str]]:
-    """Return table rows of the levels location, family and law of each effect: effect, level with name, probability."""
+    """Return three table rows per named effect: its location, family and law.
+
+    A row contains the title of the effect (in its first row only), the most probable name of the
+    level and the probability of this name.
+    """
     rows = []
     for effect, answer in zip(gap.effects, gap.answers or (), strict=bool(gap.answers)):
         place, chance = next(iter(answer["places"].items()))
@@ -276,7 +335,7 @@ def _level_rows(gap: Gap) -> list[tuple[str, str, str]]:
 
 
 def _rejection_row(rejection: Rejection) -> tuple[str, str, str, str]:
-    """Return table cells: what, test, value, needed."""
+    """Return the table cells of a rejected effect: effect, failed test, value of the test, required value."""
     what = _title(rejection) if rejection.name else "all effects"
     value = f"{rejection.value:.3g}" if math.isfinite(rejection.value) else "-"
     limit = f"more than {rejection.limit:.3g}" if math.isfinite(rejection.limit) else "-"
@@ -288,17 +347,24 @@ def _rms(values: np.ndarray | None) -> float:
 
 
 def _trace_row(trace: InputTrace) -> tuple[str, str, str, str]:
-    """Return table cells: residual input, RMS of the given and of the patched model, fraction explained."""
+    """Return the table cells of a residual input (force, flow or command that a model misses) over one run.
+
+    The cells are its name, its RMS with the given and with the patched model, and the fraction of
+    its mean square that the patched model removes.
+    """
     given, left = _rms(trace.given), _rms(trace.remaining)
     explained = f"{100.0 * max(0.0, 1.0 - (left / given) ** 2):.0f} %" if given > 0.0 else "-"
     return lack_title(trace.balance, trace.axis), amount(given, trace.unit), amount(left, trace.unit), explained
 
 
 def draw_traces(traces: tuple[InputTrace, ...]) -> bytes:
-    """Draw residual inputs over time: missing in the given model, added by the accepted effects, still missing.
+    """Draw residual inputs (forces, flows and commands that the models miss) over time, one plot each.
+
+    The lines are the residual input of the given model, what the accepted effects add in the
+    patched model, if known, and the residual input of the patched model.
 
     Args:
-        traces: of one run.
+        traces: residual inputs of one run.
 
     Returns:
         A PNG.

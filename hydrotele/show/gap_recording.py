@@ -46,8 +46,8 @@ def gap_blueprint(
     Args:
         scene: 3D view.
         before: prediction of the given model.
-        models: {`nominal` or `patched`: (prediction, any value)}.
-        channels: channels of the first tab.
+        models: {`nominal` or `patched`: (prediction, any value)}; the second value is not used.
+        channels: channels that the first tab shows.
 
     Returns:
         The layout; the time panel is paused on the timeline `time`.
@@ -208,7 +208,7 @@ def _log_channels(out, models) -> None:
 
 
 def _log_rms(out, models, floor: float | None) -> None:
-    """Add lines of the RMS error of all channels over time windows, per model, to a recording.
+    """Add lines of the RMS whitened error of all channels in windows of 0.5 s, per model, to a recording.
 
     Args:
         out: recording stream.
@@ -228,7 +228,16 @@ def _log_rms(out, models, floor: float | None) -> None:
 
 
 def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
-    """Add the intervals with significant errors to a recording: a thick red line at zero, and texts."""
+    """Add the intervals with significant errors to a recording: a thick red line at zero, and texts.
+
+    The intervals with the largest errors due to an unknown effect are added as texts only.
+
+    Args:
+        out: recording stream.
+        gap: result of the search.
+        windows: intervals with significant errors of the given model.
+        before: prediction of the given model.
+    """
     import rerun as rr
 
     time = np.array([t for w in windows for t in (w.start, w.stop, w.stop + 1e-6)])

@@ -115,7 +115,8 @@ _COMMANDS = {
 def _open_loop_content(gap: Gap) -> dict[str, Any] | None:
     """Return text and table rows of the open-loop position errors of a mechanism, per drive.
 
-    The columns are the errors of the given and, if there is one, the corrected model.
+    The columns are the errors of the given and, if there is one, the corrected model. The result is
+    None if no open-loop errors were computed.
     """
     if not gap.open_loop:
         return None
@@ -167,7 +168,7 @@ def _effect_rows(gap: Gap) -> list[dict[str, Any]]:
 def _calibration_rows(gap: Gap) -> list[dict[str, Any]]:
     """Return table rows of the parameters that the search calibrated before it tested effects.
 
-    The largest changes are the first rows.
+    The first rows are those with the largest change in relation to the width of the interval.
     """
     rows = []
     for key in most_moved(gap) if gap.calibration else ():
@@ -204,8 +205,8 @@ def _residual_input_rows(gap: Gap) -> list[tuple[str, str, float]]:
     """Return table rows of the forces, flows and commands that the corrected model still misses.
 
     Returns:
-        (name, percentage of the largest plausible value, bar length relative to the first row), the
-        largest first.
+        (name, size as a percentage of full force, rated flow or full command, size relative to the
+        first row), the largest first.
     """
     return [
         (lack_words(lack), f"{100 * lack.part:.2g} %", lack.part / gap.lacks[0].part)
@@ -244,9 +245,13 @@ def _channel_error_rows(before: Prediction, after: Prediction | None) -> list[di
 
 
 def _law_residual_table(gap: Gap, is_patched: bool) -> dict[str, Any]:
-    """Return the table of the residuals of each physical law at each component, relative to noise.
+    """Return the table of the RMS residuals of each physical law at each component, with ratios to noise.
 
     With a corrected model (`is_patched`), each component has two columns: given and patched.
+
+    Returns:
+        `head`: (component, model) of each column. `rows`: name and description of a law, and its
+        cells.
     """
     places = list(dict.fromkeys(place for by_place in gap.laws.values() for place in by_place))
     keys = {"before": "given", "after": "patched"} if is_patched else {"before": "given"}
@@ -273,7 +278,7 @@ def _law_residual_cell(residual: Mapping[str, float] | None, key: str, unit: str
 
 
 def _residual_colour(ratio: float) -> str:
-    """Return the cell colour (#rrggbb) of a residual-to-noise ratio: white up to 1.2, amber, then red."""
+    """Return the cell colour (#rrggbb) of a residual-to-noise ratio: white up to 1.2, then amber, red from 10."""
     part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_MAX_COLOUR_RATIO / 1.2), 0.0), 1.0)
     stops = ((255, 255, 255), (253, 226, 170), (240, 160, 110))
     low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
@@ -282,9 +287,9 @@ def _residual_colour(ratio: float) -> str:
 
 
 def _ranking(gap: Gap) -> list[dict[str, Any]]:
-    """Return table rows of the 12 best single effects, in the order of the ranking.
+    """Return table rows of the up to 12 best single effects, in the order of the ranking.
 
-    The gain is the decrease of -2 log likelihood minus the complexity penalty.
+    The gain of an effect is the decrease of -2 log likelihood minus the complexity penalty.
     """
     shown = gap.ranking[:_MAX_RANKED_EFFECTS]
     best = max((c.gain - c.charge for c in shown), default=1.0)
@@ -329,7 +334,7 @@ def _format_number(value: Any) -> str:
 
 
 def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
-    """Return table rows of sensor noise per channel: estimated and stated standard deviation, ratio."""
+    """Return table rows of sensor noise: channel, estimated and stated standard deviation, their ratio."""
     rows = []
     for channel, (found, stated) in gap.noise.items():
         unit, known = default_channel_unit(channel), math.isfinite(stated)
@@ -369,7 +374,7 @@ _MAX_HEAT_MAP_RATIO = 6.0  # times sensor noise, maximum upper limit of the colo
 
 
 def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> bytes:
-    """Draw the prediction errors of all channels over time windows as a heat map, relative to noise.
+    """Draw the RMS prediction errors of all channels in windows of 0.5 s as a heat map, relative to noise.
 
     Args:
         before: one-step predictions of the given model.
@@ -414,7 +419,9 @@ def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> by
 
 
 def draw_channel_predictions(before: Prediction, after: Prediction, channel: str, is_patched: bool) -> bytes:
-    """Draw measurements, one-step predictions and errors of a channel, and an enlarged worst interval.
+    """Draw measurements, one-step predictions and errors of a channel over a run.
+
+    A second column enlarges the 2 s around the largest error of the given model.
 
     Args:
         before: predictions of the given model.

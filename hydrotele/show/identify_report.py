@@ -29,7 +29,9 @@ MEASURED_COLOUR, NOMINAL_COLOUR, IDENTIFIED_COLOUR = "#262b33", "#e07b00", "#176
 
 
 def draw_force_predictions(forces: HeldOutForces, drive: str, judged: HeldOutError) -> bytes:
-    """Draw measured and predicted force of a drive on the held-out run, and the errors with a noise band.
+    """Draw measured and predicted force of a drive on the held-out run, and the prediction errors below.
+
+    A grey band shows twice the RMS noise, if known.
 
     Args:
         forces: measured forces, and forces predicted by the given and the identified model.

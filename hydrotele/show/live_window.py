@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.logged_poses import compile_visual_model
 from hydrotele.show.offscreen_renderer import has_screen
+from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.simulate.plant import Plant
 
 _NO_SCREEN_ADVICE = "add --no-viewer and use --device gamepad, spacemouse or scripted:FILE"
@@ -21,7 +21,7 @@ _CAMERA_DISTANCE, _CAMERA_AZIMUTH, _CAMERA_ELEVATION = (
 
 
 class Window:
-    """Passive viewer of a plant; open until the user or the program closes it."""
+    """MuJoCo viewer window that shows a plant simulated elsewhere, until the user or the program closes it."""
 
     def __init__(self, plant: Plant, pressed: Callable[[int], None] | None = None) -> None:
         """Open the window.
@@ -36,7 +36,7 @@ class Window:
         check_screen()
         from mujoco import viewer
 
-        self._model = compile_visual_model(plant.machine, plant.ground, plant.surroundings)
+        self._model = compile_mechanism(plant.machine, ground=plant.ground, surroundings=plant.surroundings)
         assert self._model.nq == plant.model.nq
         self._data = mujoco.MjData(self._model)
         self._handle = viewer.launch_passive(
@@ -57,10 +57,14 @@ class Window:
         self._painter.start()
 
     def show(self, qpos: np.ndarray, rows: Sequence[tuple[str, str]]) -> bool:
-        """Display joint positions (nq,) and a table of texts in the next frame of the window.
+        """Set the joint positions and the table of texts that the next frame of the window displays.
+
+        Args:
+            qpos: (nq,) joint positions [m], [rad]; they are copied.
+            rows: (name, value) of each row of the table.
 
         Returns:
-            False if the user has closed the window.
+            False if the user has closed the window, else True.
         """
         if not self._handle.is_running():
             return False
@@ -69,7 +73,7 @@ class Window:
         return True
 
     def _draw_frames(self) -> None:
-        """Draw the latest state in a loop, run in a separate thread, so that a slow screen does not block."""
+        """Draw the latest state in a loop, which runs in a separate thread so that a slow screen does not block."""
         while self._fresh.wait() and not self._over:
             self._fresh.clear()
             assert self._newest
@@ -84,7 +88,7 @@ class Window:
             self._handle.sync()
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, after waiting for the last frame for at most 5 s."""
         self._over = True
         self._fresh.set()
         self._painter.join(_CLOSE_TIMEOUT)
@@ -93,6 +97,8 @@ class Window:
 
 def check_screen(advice: str = _NO_SCREEN_ADVICE) -> None:
     """Check that a window can be opened, because MuJoCo's viewer hangs without a screen.
+
+    The check opens an invisible window and closes it.
 
     Args:
         advice: advice for the error message.

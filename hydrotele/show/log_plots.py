@@ -128,7 +128,15 @@ def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = N
 
 
 def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
-    """Draw a channel of two logs in a cell of the figure's grid and, below, their difference."""
+    """Draw a channel of two logs in a cell of the figure's grid and, below, their difference.
+
+    Args:
+        figure: the figure.
+        place: cell of its grid.
+        first: log that defines the times of the difference.
+        other: log that is subtracted.
+        name: name of the channel.
+    """
     cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
     upper = figure.add_subplot(cell[0])
     lower = figure.add_subplot(cell[1], sharex=upper)
@@ -148,7 +156,14 @@ def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -
 
 
 def _format_axes(axes: "Axes", time: np.ndarray, traces: Sequence[Trace], title: str) -> None:
-    """Set title, axis limits and units of a plot."""
+    """Set title, axis limits and unit label of a plot.
+
+    Args:
+        axes: the plot.
+        time: (n,) times [s]; the first and last one limit the x axis.
+        traces: lines of the plot; their values determine the limits of the y axis.
+        title: title of the plot.
+    """
     units = dict.fromkeys("" if trace.unit == "1" else trace.unit for trace in traces)
     axes.set_title(title)
     axes.set_ylabel(", ".join(units))

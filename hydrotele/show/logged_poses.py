@@ -11,7 +11,6 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surrounding_objects import SurroundingObject, read_soil_from_log
 from hydrotele.simulate.closed_loops import close_along_motion, dependent_joints
-from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
 
 _OBJECTS_ADAPTER = TypeAdapter(list[SurroundingObject])
@@ -31,28 +30,12 @@ class Poses(NamedTuple):
     quaternion: np.ndarray
 
 
-def compile_visual_model(
-    machine: Machine, ground: bool = True, surroundings: tuple[SurroundingObject, ...] = ()
-) -> mujoco.MjModel:
-    """Compile a machine with its visual geometry, which simulated plants omit for speed.
-
-    Args:
-        machine: the machine.
-        ground: whether there is a ground.
-        surroundings: objects around the machine.
-
-    Raises:
-        InputError: the MJCF cannot be assembled.
-    """
-    root = assemble_mjcf(machine, ground=ground, surroundings=surroundings)
-    return mjcf_document(root).compile()
-
-
 def extract_joint_motion(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     """Return the logged motion of the joints of a machine that no closed loop determines.
 
     Measured channels are preferred. True channels are used for joints without a sensor, such as a
-    hanging grapple.
+    hanging grapple. Missing values are replaced by the last known value. Joints that are not logged
+    are omitted.
 
     Args:
         machine: the machine.
@@ -77,7 +60,10 @@ def extract_joint_motion(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def _repeat_last_known_value(values: np.ndarray) -> np.ndarray:
-    """Fill missing values (NaN) with the last known value, at the start with the first; 0 if none is known."""
+    """Return values with missing ones (NaN) replaced by the last known value before them.
+
+    At the start they are replaced by the first known value; if none is known, by 0.
+    """
     known = np.flatnonzero(np.isfinite(values))
     if len(known) in (0, len(values)):
         return values if len(known) else np.zeros(len(values))
@@ -130,7 +116,7 @@ def compute_joint_positions(
 
     Args:
         machine: the machine.
-        model: model of the machine from `compile_visual_model`.
+        model: model of the machine from `compile_mechanism`.
         joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
         log: log of true states; required if the model contains surrounding objects.
 
@@ -154,7 +140,7 @@ def body_poses(
 
     Args:
         machine: the machine.
-        model: model of the machine from `compile_visual_model`.
+        model: model of the machine from `compile_mechanism`.
         joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
         log: log of true states; required if the model contains surrounding objects.
 

@@ -17,9 +17,9 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
 from hydrotele.machine.machine import Machine
-from hydrotele.show.logged_poses import compile_visual_model
 from hydrotele.show.visual_geometry import visible_bounds
 from hydrotele.simulate.closed_loops import close_loops
+from hydrotele.simulate.mechanism import compile_mechanism
 
 _BACKENDS = ("egl", "osmesa")
 _PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
@@ -50,7 +50,7 @@ def render_machine(
             without a screen (the message names the packages to install), or the file cannot be
             written.
     """
-    model = compile_visual_model(machine)
+    model = compile_mechanism(machine)
     data = mujoco.MjData(model)
     close_loops(machine, model, data, dict(joints or {}))
     render_model(model, data, path, camera, size)

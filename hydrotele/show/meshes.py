@@ -85,7 +85,13 @@ def make_cylinder_mesh(radius: float, half_length: float, segments: int = 24) ->
 
 
 def make_capsule_mesh(radius: float, half_length: float, segments: int = 16) -> Mesh:
-    """Create the triangle mesh of a capsule along z [m]; `half_length` excludes the hemispheres."""
+    """Create the triangle mesh of a capsule along z, a cylinder with two hemispheres.
+
+    Args:
+        radius: radius of cylinder and hemispheres [m].
+        half_length: half length of the cylinder without the hemispheres [m].
+        segments: number of segments around the axis.
+    """
     rise = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 2)
     rise = np.sort(np.append(rise, (0.0, 0.0)))
     slopes = np.stack([np.cos(rise), np.sin(rise)], axis=1)

@@ -72,7 +72,10 @@ def make_box_marker(middle, half_sizes, colour, rotation: np.ndarray | None = No
 
 
 def make_polyline_markers(points, radius: float, colour) -> list[Marker]:
-    """Create lines to add to a rendered scene that connect consecutive points (n, 3) [m]."""
+    """Create lines to add to a rendered scene that connect consecutive points (n, 3) [m].
+
+    The lines have a radius [m] and an RGBA colour.
+    """
     return [make_line_marker(a, b, radius, colour) for a, b in zip(points[:-1], points[1:], strict=True)]
 
 

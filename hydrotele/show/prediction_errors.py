@@ -73,7 +73,7 @@ def windowed_errors(prediction: Prediction, window: float = WINDOW_DURATION) -> 
 
 
 def channel_rms(prediction: Prediction) -> np.ndarray:
-    """Return the RMS over a run of the prediction errors divided by their predicted noise.
+    """Return the RMS over a run of the one-step prediction errors divided by their predicted noise.
 
     Returns:
         (c,) value per channel [1]; 1 for a perfect model, NaN without measurements.
@@ -121,7 +121,7 @@ def find_gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWind
 
 
 def find_most_improved_channels(before: Prediction, after: Prediction, count: int) -> list[str]:
-    """Return the channels whose mean square prediction error decreases most from one model to another.
+    """Return the channels whose mean square whitened error decreases most from one model to another.
 
     If both predictions are equal, the channels with the largest mean square error are returned.
 

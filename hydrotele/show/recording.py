@@ -142,7 +142,14 @@ def _make_plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[
 
 
 def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float = 1.2):
-    """Return rerun's line style of a channel; the colour is paler for all logs but the first (rank 0)."""
+    """Return rerun's line style of a channel; the colour is paler in all logs but the first (rank 0).
+
+    Args:
+        colour: RGB colour of the axis, 0 .. 255.
+        name: name in the legend.
+        rank: index of the log in the recording.
+        width: line width in the viewer.
+    """
     import rerun as rr
 
     paler = [round(c + (_WHITE_FRACTION if rank else 0.0) * (255 - c)) for c in colour]

@@ -1,4 +1,4 @@
-"""Render one image in a child process of `picture`, using the OpenGL driver set by MUJOCO_GL.
+"""Render one image in a child process of `show.machine_image`, using the OpenGL driver set by MUJOCO_GL.
 
 Usage: `python render_process.py FOLDER`. The program reads `model.mjb` and `task.npz` in the folder and
 writes `pixels.npy`.

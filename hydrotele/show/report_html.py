@@ -165,8 +165,9 @@ def write_sections(
 class Interval(NamedTuple):
     """Positions of an estimate and its confidence interval in a drawing of `width` [px].
 
-    `start` and `length` are those of the interval, `model` is the position of the value in the given model.
-    None means not finite.
+    `value` is the position of the estimate, `model` that of the value in the given model. The
+    interval begins at `start` and has the length `length`. None stands for a number that is not
+    finite.
     """
 
     width: int
@@ -200,7 +201,8 @@ def scale_interval_to_pixels(value: float, low: float, high: float, model: float
 class Dumbbell(NamedTuple):
     """Positions of two error ratios in a drawing of `width` [px]: before and after a correction of the model.
 
-    `one` is the position of the ratio 1, that of a perfect model.
+    `one` is the position of the ratio 1, that of a perfect model. `after` is None without a
+    correction.
     """
 
     width: int

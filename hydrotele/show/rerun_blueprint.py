@@ -36,7 +36,7 @@ _LEGEND_PLOT_HEIGHT = 1.5  # height of a plot with legend, relative to other plo
 
 
 class Plot(NamedTuple):
-    """Time-series view.
+    """Content of one time-series view of the rerun viewer.
 
     Attributes:
         kind: kind of the channels.
@@ -56,11 +56,11 @@ class Plot(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """3D view.
+    """Content and camera of the 3D view of the rerun viewer.
 
     Attributes:
         title: title of the view.
-        contents: entity paths.
+        contents: paths of the displayed entities.
         trails: entities of which only the last seconds are displayed.
         camera_position: (3,) position of the camera [m].
         target: (3,) point at which the camera looks [m].
@@ -106,7 +106,7 @@ def make_blueprint(
 
 
 def make_machine_view(scene: Scene):
-    """Return the three-dimensional view of a scene, with trails of the last seconds."""
+    """Return rerun's 3D view of a scene; of its trails, only the last 5 s are visible."""
     import rerun.blueprint as rrb
 
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL_DURATION)

@@ -12,7 +12,6 @@ from hydrotele.show import meshes as shapes
 from hydrotele.show.logged_poses import (
     Poses,
     body_poses,
-    compile_visual_model,
     extract_joint_motion,
     logged_surroundings,
     point_trajectory,
@@ -29,6 +28,7 @@ from hydrotele.show.soil_shapes import (
     trench_mesh,
 )
 from hydrotele.show.visual_geometry import BodyMesh, body_meshes, ground_height, visible_bounds
+from hydrotele.simulate.mechanism import compile_mechanism
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -160,9 +160,17 @@ def log_tip(
     clock: "rr.TimeColumn",
     ghost: bool = False,
 ) -> None:
-    """Add the path of the tool tip (n, 3) [m] to a recording: whole path, latest part, current point.
+    """Add the path of the tool tip to a recording: whole path, latest part, current point.
 
     The entity `trail` has one line segment per row; the layout selects the displayed seconds.
+    Nothing is added for fewer than two rows.
+
+    Args:
+        stream: recording stream.
+        root: parent entity of the path.
+        tip: (n, 3) positions in the world [m], or None.
+        clock: n times.
+        ghost: whether the machine is a second one, whose path is blue and thinner.
     """
     import rerun as rr
 
@@ -198,13 +206,21 @@ _EYE_DISTANCE = 1.4  # camera distance, relative to the radius of the scene
 
 
 def log_scene(stream, entries) -> Scene:
-    """Write machines, trails and surroundings to a recording, and return the scene for the blueprint."""
+    """Write machines, paths of their tool tips and surroundings to a recording; return the 3D view.
+
+    The first machine is solid, the others are transparent. Ground, soil and camera are those of the
+    first machine.
+
+    Args:
+        stream: recording stream.
+        entries: {root entity, such as `measured`: (machine, log)}.
+    """
     contents, trails, models, scene = [], [], {}, None
     for name, (machine, log) in entries.items():
         things = logged_surroundings(log)
         key = machine.model_dump_json() + log.metadata.get("surroundings", "")
         if key not in models:
-            models[key] = compile_visual_model(machine, surroundings=things)
+            models[key] = compile_mechanism(machine, surroundings=things)
         model = models[key]
         poses = body_poses(machine, model, extract_joint_motion(machine, log), log)
         clock, tip = time_column(log.time), compute_tip_path(machine, log, poses)

@@ -88,7 +88,11 @@ def run_rerun(arguments: Sequence[str], uses_temporary_home: bool = False) -> It
 
     Args:
         arguments: command-line arguments.
-        uses_temporary_home: use a temporary home folder, so that settings of the user are not read or written.
+        uses_temporary_home: use a temporary home folder, so that settings of the user are not read
+            or written.
+
+    Yields:
+        The running program.
 
     Raises:
         InputError: the rerun program is not installed.
@@ -268,7 +272,15 @@ def take_screenshot(
 
 
 def _viewer_reports(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> tuple[str, ...]:
-    """Return the warnings and errors that the viewer reports for the recording, not those of images taken again."""
+    """Return the warnings and errors that the viewer reports for its views and in its log.
+
+    Log messages about images that could not be rendered are omitted, because these are taken again.
+
+    Args:
+        client: connection to the viewer.
+        rrd: recording file, for error messages.
+        deadline: value of `time.monotonic` after which an error is raised [s].
+    """
     views = _read_state(client, rrd, deadline).views
     shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
     entries = [e.message for e in client.get_logs() if e.level in ("WARN", "ERROR")]
@@ -276,7 +288,18 @@ def _viewer_reports(client: "ViewerClient", rrd: str | os.PathLike, deadline: fl
 
 
 def _read_state(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> "ViewerState":
-    """Return the state of the viewer; a busy computer without a graphics card may need several attempts."""
+    """Return the state of the viewer; repeat the request after timeouts, until a deadline.
+
+    A busy computer without a graphics card may need several attempts.
+
+    Args:
+        client: connection to the viewer.
+        rrd: recording file, for error messages.
+        deadline: value of `time.monotonic` after which a timeout is an error [s].
+
+    Raises:
+        InputError: the viewer does not answer before the deadline.
+    """
     while True:
         try:
             return client.get_state()
@@ -351,9 +374,10 @@ def _check_viewer_alive(viewer: Viewer, rrd: Path, deadline: float) -> None:
 
 
 def _take_settled_screenshot(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> bytes:
-    """Take screenshots until two successive ones are equal, because then all data are displayed.
+    """Take at least three screenshots, until two successive ones are equal; return the last one as PNG.
 
-    After the deadline, the latest image is returned.
+    Equal images show that all data are displayed. After the deadline (a value of `time.monotonic`
+    [s]), the latest image is returned.
 
     Raises:
         InputError: there is no image before the deadline.

@@ -32,8 +32,8 @@ class SoilShape(NamedTuple):
     """Soil at one time.
 
     Attributes:
-        surface: (m,) height of the profile [m].
-        loose: (m,) thickness of the loose soil on top [m].
+        surface: (m,) heights of the surface along the strip of soil that the bucket digs [m].
+        loose: (m,) thickness of the loose soil below this surface [m].
         load: (k, 2) corners of the side view of the soil in the bucket, in the frame of the bucket
             (x from pin to edge, z up at attitude 0) [m]; empty if there is none.
     """
@@ -47,7 +47,8 @@ class SoilHistory(NamedTuple):
     """Soil at the rows of a log.
 
     Attributes:
-        bed: the strip of soil after the last row; gives azimuth, radii and bucket.
+        bed: the strip of soil after the last row. Azimuth and radii of the strip and the geometry
+            of the bucket are read from it.
         shapes: soil at each row.
         axes: (3, 3) directions ahead, left and up of the bucket in the frame of its link, as rows.
     """
@@ -67,7 +68,7 @@ def soil_history(machine: Machine, ground: SoilGround, log: Log, poses: Poses) -
         poses: poses of its bodies at the rows of the log.
 
     Returns:
-        Height of the strip of soil and content of the bucket at every row.
+        Heights of the strip of soil and content of the bucket at every row.
 
     Raises:
         InputError: the machine has no bucket.
@@ -104,7 +105,9 @@ def _lateral_axis_sign(poses: Poses, link: str, axis: np.ndarray, azimuth: float
 
 
 def _bucket_load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
-    """Compute the side view of the soil in a bucket, which fills it up to a level surface.
+    """Compute the side view of the soil in a bucket, which fills the bucket up to a level surface.
+
+    The area of the side view is the carried volume divided by the inner width of the bucket.
 
     Args:
         bed: soil and bucket.
@@ -132,7 +135,7 @@ def _bucket_load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
 
 
 def _keep_polygon_below(polygon: np.ndarray, up: np.ndarray, level: float) -> np.ndarray:
-    """Cut off the part of a polygon (k, 2) above `level` along the unit vector `up`; return the rest."""
+    """Return the part of a polygon (k, 2) whose projection onto the unit vector `up` is at most `level`."""
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         over_a, over_b = a @ up - level, b @ up - level
@@ -160,7 +163,7 @@ def trench_mesh(bed: SoilBed, shape: SoilShape) -> tuple[Mesh, np.ndarray]:
     low_r, high_r, low_z, high_z = borders[:-1], borders[1:], heights[:-1], heights[1:]
 
     def make_cell_triangles(*corners: tuple) -> np.ndarray:
-        """Return the triangles of one quadrilateral per cell; corners are (r, side, z) in order."""
+        """Return the triangles of one quadrilateral per cell; corners are (radius, side, height) [m] in order."""
         points = [np.stack(np.broadcast_arrays(*corner, low_r)[:3], axis=-1) for corner in corners]
         return np.stack([points[k] for k in (0, 1, 2, 0, 2, 3)], axis=1)
 

@@ -76,7 +76,11 @@ def are_numbers(values: Sequence[Any]) -> bool:
 
 
 def convert_result_for_display(study: Study, name: str) -> DisplayedResult:
-    """Convert a result of all runs to a readable unit: mm if below 2 m, deg, kN from 2 kN."""
+    """Convert a result of all runs from SI to a readable unit.
+
+    Lengths are converted to mm if all are below 2 m, angles to deg, and forces to kN if the largest is
+    at least 2 kN. Other results keep their unit.
+    """
     given = study.columns[name]
     values = np.array([math.nan if v is None else float(v) for v in given])
     unit = study.units.get(name, "1")
@@ -155,10 +159,18 @@ def _axis_positions(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
 
 
 def _mean_curve(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve of means (x, y): at each x, or over bins of x if `binned` and few runs share an x.
+    """Return a curve of mean results: at each x or, if `binned` and few runs share an x, over bins of x.
 
-    Runs with the same x are in one bin, so that all values of the other keys contribute to it. The
-    curve is empty if there are too few runs for two bins.
+    Few runs means fewer than five per distinct x. Runs with the same x are in one bin, so that all
+    values of the other keys contribute to it.
+
+    Args:
+        binned: whether x are random numbers, which may be averaged over bins.
+        x: (n,) values of the varied key.
+        y: (n,) results.
+
+    Returns:
+        x and y of the curve; empty if there are too few runs for two bins.
     """
     there = np.unique(x)
     if not binned or len(x) >= _MIN_RUNS_PER_BIN * len(there):
@@ -175,7 +187,7 @@ def _needs_log_scale(values: np.ndarray) -> bool:
 
 
 def find_heat_map_keys(study: Study) -> tuple[str, str] | None:
-    """Return the two varied grid keys that span a heat map, or None if there are more or fewer."""
+    """Return the two grid keys that span a heat map; None unless exactly two grid keys have several values."""
     keys = [key for key in study.grid if len(distinct_values(study.columns[key])) > 1]
     return (keys[0], keys[1]) if len(keys) == 2 else None
 
@@ -218,10 +230,16 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
 
 
 def _average_into_cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
-    """Average the values (n,) of n runs over the cells that two keys span.
+    """Average the results of n runs over the cells that the values of two keys span.
+
+    Args:
+        study: data of the sweep.
+        keys: names of the two keys.
+        values: (n,) results, NaN for failed runs.
 
     Returns:
-        (values of key 1, values of key 2) means, NaN where no run succeeded.
+        (a, b) means for a distinct values of the first key and b of the second; NaN where no run
+        succeeded.
     """
     texts = [[json.dumps(v) for v in distinct_values(study.columns[key])] for key in keys]
     cells = np.full((len(texts[0]), len(texts[1])), np.nan)
@@ -250,7 +268,7 @@ def _format_level(value: Any) -> str:
 
 
 def _fold_label(label: str) -> str:
-    """Break a long label into two lines."""
+    """Break a label of more than 26 characters into two lines, at the space nearest to its middle."""
     if len(label) <= 26:
         return label
     gaps = [i for i, letter in enumerate(label) if letter == " "]
@@ -339,11 +357,11 @@ def _range_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def _describe_run(study: Study, value: float, row: int) -> tuple[str, str]:
-    """Format a result and the run it belongs to, with the first three varied keys of that run.
+    """Format a result and, as a second text, its run with the first three varied keys of the run.
 
     Args:
         study: data of the sweep.
-        value: the result.
+        value: the result, in display units.
         row: row of the run in the table.
     """
     keys = ", ".join(f"{key} {_format_value(study.columns[key][row])}" for key in study.varied_keys[:3])

@@ -152,7 +152,8 @@ def draw_nyquist(found: TeleopFindings) -> bytes:
 def draw_stability_maps(found: TeleopFindings) -> bytes:
     """Draw where each structure is stable, over one-way delay and factor on the reflected signal, as PNG.
 
-    Crosses mark cells in which a simulation disagrees.
+    There is one panel per structure. A point marks the case itself. Crosses mark cells in which a
+    simulation disagrees.
     """
     with open_report_figure(2.9 * _count_panel_rows(found)) as figure:
         seen = {one.structure: one.simulated for one in found.agreements}
@@ -256,7 +257,10 @@ def _plot_over_frequency(panel: Any, one: Any, values: np.ndarray) -> None:
 
 
 def _set_log_axes(panel: Any, least: float, most: float) -> None:
-    """Set logarithmic axes with limits that exclude rounding errors and unbounded resonances."""
+    """Make both axes of a panel logarithmic, and restrict the y limits to the range from `least` to `most`.
+
+    The range excludes rounding errors and unbounded resonances.
+    """
     panel.set_xscale("log")
     panel.set_yscale("log")
     low, high = panel.get_ylim()
@@ -408,7 +412,8 @@ _RATIO_RANGE = (0.05, 20.0)  # range of the map, relative to the maximum stable 
 def draw_loop_map(found: ScenarioFindings) -> bytes:
     """Draw where the force-reflection loop of a scenario is stable, over delay and reflected force.
 
-    The vertical axis is the hand force when the machine exerts its maximum force.
+    The horizontal axis is the one-way delay. The vertical axis is the hand force when the machine
+    exerts its maximum force; it grows with the reflection ratio. A point marks the scenario.
 
     Args:
         found: results of the analysis.

@@ -12,7 +12,10 @@ from hydrotele.teleop.linear_analysis import (
 
 
 def describe_stability(analysis: StructureAnalysis, released: bool = False) -> str:
-    """Return a short text that states whether a structure is stable, with its unstable poles.
+    """Return a short text that states whether a structure is stable, with its number of unstable poles.
+
+    A structure is stable if it has no unstable poles in contact with the task and in free motion.
+    If it is stable in contact only, the text ends with `when free`.
 
     Args:
         analysis: results of the linear analysis of the structure.

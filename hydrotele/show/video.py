@@ -13,7 +13,6 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.surrounding_objects import SoilGround
 from hydrotele.show.logged_poses import (
-    compile_visual_model,
     compute_joint_positions,
     extract_joint_motion,
     logged_surroundings,
@@ -22,7 +21,7 @@ from hydrotele.show.logged_poses import (
 from hydrotele.show.offscreen_renderer import Canvas
 from hydrotele.show.rerun_scene import compute_machine_camera, compute_tip_path
 from hydrotele.show.soil_shapes import soil_history, soil_markers
-from hydrotele.simulate.mechanism import GROUND_NAME
+from hydrotele.simulate.mechanism import GROUND_NAME, compile_mechanism
 
 _FRAME_RATE = 25.0  # 1/s, so that the video runs in real time
 
@@ -50,7 +49,7 @@ def write_video(
         message = "needs the package imageio-ffmpeg: pip install 'hydrotele[video]'"
         raise InputError("the video", message) from None
     things = logged_surroundings(log)
-    model = compile_visual_model(machine, surroundings=things)
+    model = compile_mechanism(machine, surroundings=things)
     rows = compute_joint_positions(machine, model, extract_joint_motion(machine, log), log)
     poses = poses_at_positions(model, rows)
     soil = None

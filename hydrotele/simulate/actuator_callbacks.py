@@ -1,7 +1,7 @@
 """Hydraulics inside MuJoCo at native speed: compiled actuator callbacks.
 
 Every hydraulic actuator has four activations, and its parameters are in `actuator_user`
-(`parameters.Slot`). The callback of the last one advances all of them, because they share the
+(`actuator_layout.Slot`). The callback of the last one advances all of them, because they share the
 supply, and MuJoCo clears an actuator's rates just before its callback. The last actuator also owns
 the bristle states of all axes and the state of a pump with a time constant. A force drive with
 bristles has two activations: the bristle state and the command, since MuJoCo computes the force
@@ -78,9 +78,10 @@ _kept_callbacks: list = []  # keeps the callbacks behind these symbols alive
 
 @intrinsic
 def _stack_space(typingctx, size):
-    """Return the address of a work space on the stack of the calling compiled function.
+    """Return the address of a work space on the stack of the calling function (numba intrinsic).
 
-    It has room for 2 SCRATCH_SIZE numbers; `size` is not used. It is private to the thread.
+    The work space has room for 2 * SCRATCH_SIZE 64-bit numbers. It is private to the thread and
+    valid until the calling function returns. `size` is not used.
     """
 
     def codegen(context, builder, signature, args):
@@ -92,9 +93,10 @@ def _stack_space(typingctx, size):
 
 @compiled
 def _read_passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
-    """Read MuJoCo's passive (spring and damper) force on the joint of actuator i [N] or [N m].
+    """Return MuJoCo's passive (spring and damper) force on the joint of actuator i [N] or [N m].
 
-    `m` and `d` are the addresses of mjModel and mjData; all further arguments are field offsets.
+    `m` and `d` are the addresses of mjModel and mjData. All further arguments are offsets of fields
+    of these structs [byte].
     """
     nu = carray(address_to_pointer(m + m_nu), (1,), np.int64)[0]
     nv = carray(address_to_pointer(m + m_nv), (1,), np.int64)[0]
@@ -109,9 +111,10 @@ def _read_passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passiv
 
 @compiled
 def _read_gain(m, i, m_gainprm):
-    """Read the force per command of actuator i from mjModel; it is 0 for a valve.
+    """Return the force per unit of command of actuator i, its first gain parameter in mjModel.
 
-    `m` is the address of mjModel, and `m_gainprm` the offset of `actuator_gainprm`.
+    The value is 0 for a hydraulic actuator. `m` is the address of mjModel, and `m_gainprm` the
+    offset of `actuator_gainprm` [byte].
     """
     at_gain = carray(address_to_pointer(m + m_gainprm), (1,), np.int64)[0]
     return float64_view(at_gain + 8 * _GAIN_COUNT * i, 1)[0]
@@ -119,9 +122,11 @@ def _read_gain(m, i, m_gainprm):
 
 @compiled
 def _read_terms(m, m_nnumeric, m_adr, m_size, m_data):
-    """Return a view (n,) of the table of terms (additional force and flow laws) in mjModel; empty without.
+    """Return a view (n,) of the table of terms (additional force and flow laws) in mjModel.
 
-    `m` is the address of mjModel; the other arguments are offsets of its `numeric` fields.
+    The table is the custom numeric element of the model whose first value is TERMS_MARKER, with all
+    elements after it. The view is empty if there is no such element. `m` is the address of mjModel;
+    the other arguments are offsets of its `numeric` fields [byte].
     """
     count = carray(address_to_pointer(m + m_nnumeric), (1,), np.int64)[0]
     if count > 0:
@@ -152,10 +157,14 @@ class _DataOffsets(NamedTuple):
 
 @compiled
 def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
-    """Read the inputs of force terms from mjData: the DriveState of drive i, and the state of all Drives.
+    """Read the inputs of force terms (additional force laws) of drive i from mjData.
 
-    Activations are extrapolated to the end of the step. `d` is the address of mjData, `at` the offsets
-    of its fields, `user` the actuator parameters, `gain` the force per command, and `scratch` work space.
+    Activations are extrapolated to the end of the step of length `dt`; the supply pressure follows
+    from them. `d` is the address of mjData, `at` the offsets of its fields, `user` the parameters
+    of all nu actuators, `gain` the force per unit of command of drive i, and `scratch` work space.
+
+    Returns:
+        (DriveState of drive i, Drives with the states of all drives).
     """
     count, act = int(user[_COUNT]), float64_view(d, 0)
     lengths = float64_view(carray(address_to_pointer(d + at.length), (1,), np.int64)[0], nu)
@@ -178,10 +187,11 @@ def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
 
 @compile_without_allocation
 def _write_force_drive_rates(user, u, act, rate, velocity, command, low, high, dt):
-    """Write the rates (2,) of the activations of a force drive with presliding friction.
+    """Write the rates (2,) of the two activations of a force drive with presliding friction to `rate`.
 
-    The first is the bristle state, and the second the command, limited to `low` .. `high`. It reaches
-    its new value within the step.
+    The first activation is the bristle state. The second follows the command, limited to `low` ..
+    `high`, and reaches it at the end of the step of length `dt`. `act` (2,) are both at the start
+    of the step, and u is the index of the first parameter of this drive in `user`.
     """
     rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _BRISTLE_INERTIA], dt)
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
@@ -189,10 +199,11 @@ def _write_force_drive_rates(user, u, act, rate, velocity, command, low, high, d
 
 @compile_without_allocation
 def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
-    """Step the hydraulic circuit, and write the rates of bristles and of terms with an internal state.
+    """Write the rates of all activations of the hydraulic axes over a step, including additional states.
 
-    The arguments are those of `step_circuit`. `arrived` (nu,) are the
-    commands before those terms were added that change commands.
+    The additional states are those of bristles, of a pump and of terms with hysteresis. The
+    arguments are those of `step_circuit`. `drives.command` includes the terms that change commands,
+    and `arrived` (nu,) are the commands without these terms.
     """
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count
@@ -211,8 +222,10 @@ def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, t
 def _has_valid_indices(user, first, count, nu, free):
     """Return whether all indices among the parameters of the hydraulic axes are within bounds.
 
-    The check is needed because user code can change these parameters in a model. `nu` is the number of
-    actuators, and `free` that of activations from the first axis on. The comparisons reject NaN.
+    The check is needed because user code can change these parameters in a model. `first` is the
+    index of the first of `count` hydraulic actuators, and `nu` the number of all actuators. `free`
+    is the number of activations from that of the first hydraulic actuator on. NaN counts as out of
+    bounds.
     """
     if not (0 <= first and 1 <= count <= MAX_AXES and first + count <= nu):
         return False
@@ -245,7 +258,10 @@ def _command_or_zero(command, k):
 
 @functools.cache
 def _compile_callbacks():
-    """Compile MuJoCo's activation and force callbacks, or load them from the cache on disk.
+    """Compile the hydraulic callbacks for MuJoCo, or load them from the cache on disk.
+
+    Also register the callbacks for drives with bristles or other additional states as linker
+    symbols; the returned callbacks call them.
 
     Returns:
         (callback for `mjcb_act_dyn`, callback for `mjcb_act_bias`).
@@ -259,10 +275,13 @@ def _compile_callbacks():
 
 
 def _make_callbacks(has_extra_states):
-    """Create the callbacks for the activations and for the actuator forces.
+    """Create the callbacks for the activation rates and for the actuator forces.
 
-    With `has_extra_states`, they handle drives with bristles or other additional states. Otherwise they
-    pass such drives on to the callbacks that do.
+    With `has_extra_states`, the callbacks handle drives with bristles or other additional states.
+    Otherwise they pass such drives on to the callbacks that were created with `has_extra_states`.
+
+    Returns:
+        (callback for `mjcb_act_dyn`, callback for `mjcb_act_bias`).
     """
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
@@ -283,9 +302,11 @@ def _make_callbacks(has_extra_states):
 
     @callback(_SIGNATURE)
     def write_activation_rates(m, d, i):
-        """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`).
+        """Write activation rates to `act_dot` of mjData (callback `mjcb_act_dyn`); always return 0.
 
-        `m` and `d` are the addresses of mjModel and mjData. The last hydraulic actuator i does the work.
+        `m` and `d` are the addresses of mjModel and mjData, and i is the index of an actuator. For
+        the last hydraulic actuator, the rates of all hydraulic axes are written; for the others,
+        nothing. For a force drive with presliding friction, its own two rates are written.
         """
         if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
@@ -370,7 +391,9 @@ def _make_callbacks(has_extra_states):
     def force(m, d, i):
         """Return the force of actuator i after friction and terms (callback `mjcb_act_bias`) [N] or [N m].
 
-        `m` and `d` are the addresses of mjModel and mjData.
+        The pressures are those at the end of the step. For a force drive, the result does not
+        contain gain times command, because MuJoCo adds that. `m` and `d` are the addresses of
+        mjModel and mjData.
         """
         if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
@@ -455,7 +478,7 @@ def _make_callbacks(has_extra_states):
 
 
 def stop_profiling_clock() -> None:
-    """Remove MuJoCo's profiling clock, whose calls take 14 % of a step of these small models.
+    """Remove MuJoCo's profiling clock from this process; its calls take 14 % of a step of small models.
 
     `mjData.timer` then stays zero in this process; `mujoco.set_mjcb_time` sets a clock again.
     """
@@ -464,7 +487,7 @@ def stop_profiling_clock() -> None:
 
 
 def install_hydraulics() -> None:
-    """Install the hydraulic actuator callbacks of MuJoCo in this process; further calls have no effect.
+    """Install hydrotele's hydraulic callbacks in MuJoCo for this process; further calls have no effect.
 
     Raises:
         RuntimeError: another package has installed actuator callbacks, or the layout of MuJoCo's

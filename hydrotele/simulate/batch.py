@@ -23,15 +23,15 @@ class _Config(ctypes.Structure):
 
 
 class _NativeBatch:
-    """Owner of MuJoCo's batch; frees it when neither a `SimulationBatch` nor an array refers to it."""
+    """Owner of MuJoCo's native batch; frees it when no `SimulationBatch` or array refers to it."""
 
     def __init__(self, library: ctypes.CDLL, handle: int) -> None:
         self.library, self.handle, self.process = library, handle, os.getpid()
 
     def view_memory(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
-        """Return an array view, of a shape and number type, of native memory at an address.
+        """Return an array of a shape and number type that shares the native memory at an address.
 
-        The array keeps the batch alive.
+        The array keeps the native batch alive.
         """
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
         kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # a subclass can have attributes
@@ -124,7 +124,7 @@ class SimulationBatch:
         self._library.mjb_getModel(self._require_native().handle, number, model._address)
 
     def copy_data_into(self, number: int, data: mujoco.MjData) -> None:
-        """Copy the state of simulation `number` into `data`, which must have the same sizes."""
+        """Copy the mjData of simulation `number` into `data`, which must have the same sizes."""
         self._library.mjb_getData(self._require_native().handle, number, data._address)
 
     def _require_native(self) -> _NativeBatch:
@@ -139,11 +139,14 @@ class SimulationBatch:
         return self._native
 
     def close(self) -> None:
-        """Free the memory as soon as no array refers to it."""
+        """Release the simulations; the native memory is freed once no array refers to it.
+
+        `state` becomes an empty array, and further calls of the other methods raise RuntimeError.
+        """
         self._native, self.state = None, np.empty((0, 0))
 
     def __reduce__(self):
-        """Raise an error: native simulations cannot be copied or pickled."""
+        """Raise TypeError when the object is copied or pickled, since it refers to native memory."""
         raise TypeError(
             "simulations in native memory can be neither copied nor pickled: create a second"
             " environment with the same options and seed"

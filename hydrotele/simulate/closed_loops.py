@@ -20,9 +20,8 @@ from hydrotele.multibody import closures
 from hydrotele.multibody.chain import Chain, load_chain
 from hydrotele.multibody.closures import close_loops_from
 from hydrotele.simulate.mechanism import (
-    assemble_mjcf,
+    compile_mechanism,
     drive_and_load_dofs,
-    mjcf_document,
     pin_site_name,
     set_drives_to_load_positions,
     tilt_joint_name,
@@ -35,7 +34,11 @@ _MOTION_TOLERANCE = 1.0e-9  # the same for poses that are only displayed [m]
 
 
 def dependent_joints(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the joints whose positions follow from the loops: those of tubes, rods and undriven links."""
+    """Return the names of the joints whose positions follow from the closed loops.
+
+    These are the hinges of tubes, the slides of rods, and the undriven joints of links within a
+    closure.
+    """
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
     tilts = [tilt_joint_name(name) for name in cylinders if has_ball_ends(machine, name)]
@@ -43,10 +46,10 @@ def dependent_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def independent_loop_joints(machine: Machine) -> list[str]:
-    """Return the names of the independent joints that change the shape of a loop.
+    """Return the names of the independent joints that change the shape of a closed loop.
 
-    These are the joints that a cylinder moves and those within a closure. The joint of a saw, for
-    example, is part of no loop.
+    These are the joints that a cylinder moves and the driven joints within a closure. The joint of
+    a saw, for example, is part of no loop.
     """
     following = dependent_joints(machine)
     joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
@@ -58,7 +61,7 @@ def independent_loop_joints(machine: Machine) -> list[str]:
 
 
 def count_pins(model: mujoco.MjModel) -> int:
-    """Return the number of pins of the machine, which are `connect` constraints in its MuJoCo model."""
+    """Return the number of pins that close loops, the `connect` constraints of a MuJoCo model."""
     return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
 
 
@@ -71,7 +74,10 @@ def compute_loop_closure_error(model: mujoco.MjModel, data: mujoco.MjData) -> fl
 
 
 def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the MuJoCo site ids (p,) at the first half of each of p pins, and (p,) at its second half."""
+    """Return two arrays (p,) of MuJoCo site ids: those at the first and at the second half of p pins.
+
+    The pins are the `connect` constraints of the model.
+    """
     pins = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
     return model.eq_obj1id[pins], model.eq_obj2id[pins]
 
@@ -113,17 +119,17 @@ def _make_linkage(machine: Machine, model: mujoco.MjModel) -> _Linkage:
 
 
 def load_closed_chain(machine: Machine, target: Mapping[str, float] | None = None) -> Chain:
-    """Return the kinematic chain of a machine, starting from a position with closed loops.
+    """Return the kinematic chain of a machine; its start position (`Chain.start`) has closed loops.
 
     Args:
         machine: the machine.
-        target: joint name -> angle [rad] or position [m]; other joints stay at home.
+        target: joint name -> angle [rad] or position [m] in the start position; other joints are at
+            home.
 
     Raises:
         InputError: the linkages do not close at this position.
     """
-    root = assemble_mjcf(machine, 1.0e-3, ground=False, visuals=False)
-    model = mjcf_document(root).compile()
+    model = compile_mechanism(machine, ground=False, visuals=False)
     data = mujoco.MjData(model)
     close_loops(machine, model, data, target or {})
     chain = load_chain(model)
@@ -149,7 +155,11 @@ def close_loops(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, ta
 
 
 def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
-    """Move from the home position to the target in small steps and close the loops at each step."""
+    """Move the independent joints from home to their targets in small steps, and close the loops.
+
+    The loops are closed at each step. `target` is that of `close_loops`, and `data.qpos` is
+    written. Raise InputError if a loop does not close.
+    """
     following = dependent_joints(machine)
     names = [n for n in machine.joints if n not in following]
     places = [model.joint(n).qposadr[0] for n in names]
@@ -171,13 +181,13 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
 
 
 def _solve_closure(linkage: _Linkage, data: mujoco.MjData, tolerance: float) -> bool:
-    """Close all loops by moving the dependent joints from their positions in `data.qpos`.
+    """Close all loops by moving the dependent joints, starting from their positions in `data.qpos`.
 
-    Also updates the positions of bodies and sites in `data`. `tolerance` is the pin distance at which
-    Newton's method stops [m].
+    Also update the positions of bodies and sites in `data`. Newton's method stops when the largest
+    distance between the two halves of a pin is `tolerance` [m].
 
     Returns:
-        Whether the loops are closed to 1000 times this distance.
+        Whether the remaining distance is less than 1000 times the tolerance.
     """
     _, chain, following = linkage
     if not len(following):
@@ -198,8 +208,9 @@ def close_along_motion(
 ) -> np.ndarray:
     """Compute the poses of the whole machine with closed loops along a motion of its independent joints.
 
-    The first row, and each row after a jump, is closed from the home position. The other rows are
-    closed by Newton's method from the previous row. Thus every linkage keeps its assembly mode.
+    The first row, and each row in which a joint of a loop jumps by more than 0.2 rad or 0.2 m, is
+    closed from the home position. The other rows are closed by Newton's method from the previous
+    row. Thus every linkage keeps its assembly mode.
 
     Args:
         machine: the machine.
@@ -240,7 +251,10 @@ def close_along_motion(
 
 
 def _aim_cylinders(machine, model, data) -> None:
-    """Set tube angles and rod displacements from the pin positions, to start Newton's method near the solution."""
+    """Set tube angles and rod displacements in `data.qpos` so that every tube points to its rod pin.
+
+    This is the start value of Newton's method.
+    """
     for _ in range(2):
         for name, axis in machine.axes.items():
             if not axis.cylinder:

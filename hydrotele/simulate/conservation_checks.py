@@ -38,11 +38,12 @@ def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray
         controls: (nstep, nu) commands of every physics step.
 
     Returns:
-        `seconds`: simulated time [s]. `flow_balance` [1]: largest |in - out - compressed| of a chamber,
-        relative to the volume that flowed through it; None without hydraulic axes. `energy_balance` [1]:
-        |work of the drives - damping - change of mechanical energy|, relative to the work of all
-        drives. It is None if the machine touched something, reached a limit, or has drives without
-        hydraulics.
+        `seconds`: simulated time [s]. `flow_balance` [1]: largest |in - out - compressed| of a
+        chamber, relative to the volume that flowed through it; None without hydraulic axes.
+        `energy_balance` [1]: |work of the drives - damping - change of mechanical energy|, relative
+        to the work of all drives (the sum of the magnitudes of its increments). It is None if the
+        machine touched something, reached a joint limit, has drives without hydraulics, or did at
+        most 1 J of work.
     """
     model = plant.model
     data = mujoco.MjData(model)
@@ -66,10 +67,13 @@ def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray
 def _compute_work_and_volume_error(plant, x, v, act, more, dt):
     """Compute the work of the hydraulic drives and the largest volume balance error of any chamber.
 
-    `more` (n, nu, 3) are the forces and flows of terms, as `evaluate_terms` returns them.
+    The n rows are successive states, `dt` [s] apart: x and v (n, nu) are the drive positions and
+    velocities, act (n, na) the activations, and `more` (n, nu, 3) the forces and flows of terms
+    (`evaluate_terms`).
 
     Returns:
-        (work since the first row (n,) [J], relative error [1] or None without hydraulic axes).
+        (work since the first row (n,) [J], relative volume error [1] or None without hydraulic
+        axes).
     """
     user, count = plant.model.actuator_user, plant.hydraulic
     if not count:
@@ -84,9 +88,11 @@ def _compute_work_and_volume_error(plant, x, v, act, more, dt):
 
 
 def _volume_errors(plant, i, table, act, x, v, more, dt):
-    """Yield the relative oil volume balance error [1] of the head and the rod chamber of axis i.
+    """Yield the relative oil volume balance error [1] of the head and then of the rod chamber of axis i.
 
-    `table` has the flows of `compute_state_flows_and_forces`, and `more` the forces and flows of terms.
+    The error is |oil that entered - oil compressed|, divided by the volume that flowed in and out.
+    `table` has the flows of `compute_state_flows_and_forces`; the other arguments are those of
+    `_compute_work_and_volume_error`.
     """
     axis = plant.machine.axes[plant.axes[i]]
     if axis.pump:
@@ -120,11 +126,12 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
 
 @compiled
 def _compute_port_flows_and_air(pressure, relief, gain, tank, makeup, air, release):
-    """Compute relief, make-up and air quantities of one chamber from its pressures (n,) [Pa].
+    """Compute relief and make-up flow, and the effects of air, for one chamber with pressures (n,) [Pa].
 
     Returns:
-        (n,) flow through port relief and make-up valve into the chamber [m^3/s], (n - 1,) compliance
-        of air bubbles at the mean pressure of two rows [1/Pa], (n,) pressure without released air [Pa].
+        (n,) flow through port relief and make-up valve into the chamber [m^3/s], (n - 1,)
+        compliance of air bubbles at the mean pressure of two rows [1/Pa], (n,) pressure without
+        released air [Pa].
     """
     n = len(pressure)
     port, bubbles, oil = np.empty(n), np.empty(n - 1), np.empty(n)
@@ -137,10 +144,11 @@ def _compute_port_flows_and_air(pressure, relief, gain, tank, makeup, air, relea
 
 
 def _flows_after_switching(plant, i, act, x, v):
-    """Return flows and forces (`compute_state_flows_and_forces`) at the start of every step, for pump axis i.
+    """Return flows and forces at the start of every step, after the valve of axis i has switched.
 
-    The valve of this axis, which has its own pump, is already on the side that it has during the step. It
-    switches at the start of a step, while the pump keeps its speed.
+    Axis i has its own pump. Its valve switches at the start of a step, while the pump keeps its
+    speed. The result (n, 1 + 3 count) is that of `compute_state_flows_and_forces` with this signed
+    pump speed.
     """
     switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
     switched[:-1, a] = [
@@ -150,9 +158,11 @@ def _flows_after_switching(plant, i, act, x, v):
 
 
 def _compute_pump_axis_volume_errors(axis, i, table, began, act, x, v, more, dt):
-    """Yield the relative volume balance error [1] of both chambers of an axis with its own pump.
+    """Yield the relative oil volume balance errors [1] of both chambers of an axis with its own pump.
 
-    `table` has the flows of `compute_state_flows_and_forces` at the end of every step, and `began` those at its start.
+    `table` has the flows of `compute_state_flows_and_forces` at the end of every step, and `began`
+    those at its start (`_flows_after_switching`). The other arguments are those of
+    `_compute_work_and_volume_error`.
     """
     cylinder, pump = axis.cylinder, axis.pump
     p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
@@ -177,9 +187,13 @@ def _compute_pump_axis_volume_errors(axis, i, table, began, act, x, v, more, dt)
 
 
 def _compute_energy_balance_error(plant, qpos, qvel, work, dt):
-    """Compute |work of the drives - damping losses - change of mechanical energy| per work of the drives [1].
+    """Compute the relative error of the energy balance of a run [1].
 
-    Returns None if a contact or joint limit was active, or if a drive is not hydraulic or did no work.
+    It is |work of the drives - damping losses - change of mechanical energy| divided by the work.
+
+    The divisor is the sum of the magnitudes of the increments of `work` (n,), the work since the
+    first row [J]. The result is None if a contact or joint limit was active in a checked row, if a
+    drive is not hydraulic, or if the divisor is at most 1 J.
     """
     if plant.hydraulic < len(plant.axes):
         return None

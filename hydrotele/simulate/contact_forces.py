@@ -26,7 +26,7 @@ from hydrotele.simulate.surroundings import is_surrounding_object
 
 
 def mark_surrounding_bodies(plant: Plant) -> np.ndarray:
-    """Return whether each body (nbody,) is the ground, fixed to it, or a surrounding object."""
+    """Return for each body (nbody,) whether it is the world, fixed to it, or a surrounding object."""
     model = plant.model
     named = [is_surrounding_object(model.body(b).name) for b in range(model.nbody)]
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
@@ -44,8 +44,8 @@ def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
         plant: the plant.
 
     Returns:
-        (ngeom,) group of each geom, 0 for the machine and k + 1 for the k-th name; and the names:
-        `ground`, including fixed geoms, then every plate, tree, stump and log.
+        (ngeom,) group of each geom: 0 for the machine, k + 1 for `names[k]` with k from 0. And the
+        names: `ground`, including fixed geoms, then every plate, tree, stump and log.
     """
     model, numbers, names = plant.model, mark_surrounding_geoms(plant), ["ground"]
     for geom in np.flatnonzero(numbers):
@@ -124,9 +124,12 @@ def sum_contact_forces(record, total):
 
 @compiled
 def sum_contact_forces_by_group(r, totals):
-    """Write the sums of the contact forces on the machine per group, in the world frame.
+    """Compute the sum of the contact forces on the machine for each of n groups of surrounding geoms.
 
-    `totals` (3 n,) [N]: the force of group k is the k-th triple, those of groups above n are added to the last.
+    `r` is a record of `make_contact_addresses`; its `around` contains the group of every geom, 0
+    for the machine. `totals` (3 n,) is written: x, y and z of group 1, then of group 2, and so on,
+    in the world frame [N]. Groups above n are added to the last. Contacts within the machine, and
+    those between surrounding objects, are omitted.
     """
     totals[:] = 0.0
     around, wrench, groups = int64_view(r.around, r.geoms), np.empty(6), len(totals) // 3

@@ -43,7 +43,8 @@ def grip_parameters(
         pocket_centre: (3,) centre of the pocket, a box in the grab's frame [m].
         pocket_half_size: (3,) half sizes of the pocket [m]; the one along `pocket_axis` is ignored.
         object_axis: long axis of the object in its own frame (0, 1, 2).
-        reach: range along this axis in which the object can be held, from its origin [m].
+        reach: (low, high) coordinates along the object's long axis, from the object's origin,
+            between which it can be held [m].
 
     Returns:
         (GRIP_SIZE,) parameters.
@@ -67,8 +68,9 @@ def grip_parameters(
 def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle, held, row):
     """Decide whether a grab takes or releases an object, and set the weld that holds it.
 
-    An object is taken if the jaw is closed and the object's long axis passes through the middle
-    plane of the pocket: inside the box, within the angle limit and within the object's reach.
+    An object is taken if the jaw angle is at least the closing angle and the object's long axis
+    crosses the middle plane of the pocket inside the box, within the angle limit and within the
+    object's reach. A held object is released if the jaw angle is below the opening angle.
 
     Args:
         grip: (GRIP_SIZE,) result of `grip_parameters`.
@@ -78,8 +80,8 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
         quaternion: (4,) orientation of the object's body.
         angle: angle of the jaw [rad].
         held: whether the object is held.
-        row: (>= WELD_SIZE,) `eq_data` of the weld with the grab as `body1` and the object as `body2`;
-            written when the object is taken.
+        row: (>= WELD_SIZE,) `eq_data` of the weld with the grab as `body1` and the object as
+            `body2`; written when the object is taken.
 
     Returns:
         TAKEN, RELEASED or UNCHANGED.
@@ -138,6 +140,8 @@ _LOG_END_LENGTH = 0.3  # m: length at a log's end at which it cannot be held
 
 def timber_log_grip_parameters(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """Return the conditions under which a grab takes or releases a timber log, for `grip_step`.
+
+    The log may be inclined to the pocket by 20 deg. It cannot be held within 0.3 m of its ends.
 
     Args:
         model: model of the machine. The box site `<grab>_pocket` is the space between the jaws:

@@ -33,9 +33,10 @@ _PART_MASSES = {"prismatic": 400.0, "revolute": 250.0, "tube": 18.0, "rod": 9.0,
 def build_hybrid_mechanism(robot: HybridRobot) -> mujoco.MjSpec:
     """Build the closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
 
-    In this pose all bodies have the axes of frame 0. Joints have the names of the robot's joints,
-    and `leg1.roll` and `leg1.pitch` (universal joint at the carriage), `leg1` (the slide, 0 at home) and
-    `ball` (at the platform). In the world, the x
+    In this pose all bodies have the axes of frame 0. The carriage joints have the names of the
+    robot's joints. Leg 1 has the joints `leg1.roll` and `leg1.pitch` (universal joint at the
+    carriage) and `leg1` (the slide, 0 at home); the other legs alike. `ball` is the joint at the
+    platform. A position servo drives every carriage joint and every leg slide. In the world, the x
     axis of frame 0 points up, y to the right and z along the rails.
 
     Args:
@@ -91,9 +92,12 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
 
 
 def _add_legs(spec, platform, lower, upper, home: PlatformPose, robot: HybridRobot) -> None:
-    """Add the six legs, the moving platform on the first leg and `connect` constraints to the other legs.
+    """Add the six legs, the moving platform and the constraints that close the loops to the MJCF.
 
-    `lower` and `upper` (6, 3) are the joint centres of the legs in frame 0 at home [m].
+    The legs are children of `platform`, the last body of the carriage. The moving platform is a
+    child of the rod of leg 1; `connect` constraints join it to the rods of the other legs. `lower`
+    and `upper` (6, 3) are the joint centres of the legs at carriage and moving platform, in frame 0
+    at home [m].
     """
     up = home.rotation[:, 2]
     moving = None
@@ -165,7 +169,7 @@ def _add_plate(body, middle, rotation, points, thickness, mass, colour) -> None:
 
 
 def _add_rails(base, robot: HybridRobot) -> None:
-    """Add two rails along the first joint, at the height of frame 0."""
+    """Add the geoms of two rails along the range of the first joint, 0.05 m below frame 0, to `base`."""
     low, high = robot.joint_range[0]
     for side in (-0.3, 0.3):
         base.add_geom(
@@ -175,7 +179,12 @@ def _add_rails(base, robot: HybridRobot) -> None:
 
 
 def _add_carriage_shapes(links, frames, last, robot: HybridRobot) -> None:
-    """Add the carriage's geoms: bars between axes, blocks for slides, a plate below the legs."""
+    """Add geoms with mass to the carriage's bodies.
+
+    Each body gets a bar between its joint and the next, or a block if these are closer than 0.05 m.
+    The last body also gets the plate below the legs. `frames` are the joint frames, and `last` that
+    of the connecting platform, at zero joint positions.
+    """
     places = [*frames[:, :3, 3], last[:3, 3]]
     for i, (body, kind) in enumerate(zip(links, robot.kinds, strict=True)):
         mass = _PART_MASSES["revolute"] if kind == REVOLUTE else _PART_MASSES["prismatic"]
@@ -197,12 +206,13 @@ def solve_mechanism_pose(
 ) -> PlatformPose:  # fmt: skip
     """Compute the platform pose of the MuJoCo model for given carriage positions and leg readings.
 
-    Newton's method on MuJoCo's positions closes the loops. `multibody.chain` is not used, because
-    it does not support the damped ball joints, and because MuJoCo's kinematics are to be tested.
+    Carriage and legs move to their positions in steps; at each step, the loops are closed. Newton's
+    method on MuJoCo's positions closes the loops. `multibody.chain` is not used, because it does
+    not support the damped ball joints, and because MuJoCo's kinematics are to be tested.
 
     Args:
         model: model of `build_hybrid_mechanism(robot)`.
-        data: its data; its configuration is the start value of the iteration.
+        data: its data; its configuration is the start value and is replaced by the result.
         robot: the robot.
         joints: (n,) carriage positions [m] or [rad].
         legs: (6,) leg readings [m].

@@ -47,7 +47,7 @@ FLOTOR_DTYPE = np.dtype(
 
 
 class SimulatedFlotor:
-    """The simulated joystick.
+    """MuJoCo simulation of a maglev joystick with its coils and the operator's arm.
 
     Attributes:
         model: its MuJoCo model; the coils are its actuators [A].
@@ -57,8 +57,8 @@ class SimulatedFlotor:
         hand: whether the operator holds the handle.
         heat: (6,) relative heat of the coils, see `heat_step`.
         record: (1,) the simulation as a record for compiled code, see `flotor_step`.
-        has_edge_loss: whether coils lose force towards the end of their gap; `update_coil_force_constants` must then be
-            called before every period.
+        has_edge_loss: whether coils lose force towards the end of their gap;
+            `update_coil_force_constants` must then be called before every period.
     """
 
     def __init__(
@@ -145,8 +145,8 @@ class SimulatedFlotor:
     def current_limit(self) -> float:
         """Current limit of the coils at present [A].
 
-        It is the maximum current, or the continuous current after a coil has become hot and until
-        it has cooled down.
+        It is the maximum current. Once the relative heat (`heat_step`) of a coil reaches 1, it is
+        the continuous current, until the relative heat of all coils is below 0.9.
         """
         return float(self.record["allowed"][0])
 
@@ -182,9 +182,10 @@ class SimulatedFlotor:
         _step_record_in_cab(self.record, currents, operator_wrench, float(spin), float(spin_rate))
 
     def update_coil_force_constants(self) -> None:
-        """Set the force per ampere of each coil according to the flotor's pose.
+        """Set the force per ampere of each coil in the MuJoCo model according to the flotor's pose.
 
-        It decreases with the distance of a coil from its nominal position, where the field is weaker.
+        The force decreases with the distance of a coil from its nominal position
+        (`coil_force_factors`).
         """
         turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
         mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
@@ -195,7 +196,10 @@ class SimulatedFlotor:
         self._gear[:] = self._full * shares[:, None]
 
     def set_pose(self, pose: np.ndarray) -> None:
-        """Set the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
+        """Reset the simulation to a pose of the handle at rest; the heat of the coils is kept.
+
+        `pose` (6,) is the displacement [m] and the rotation vector [rad].
+        """
         mujoco.mj_resetData(self.model, self.data)
         self.record["started"] = 0
         self.data.qpos[:3] = pose[:3]
@@ -296,10 +300,10 @@ def _simulate_period(r, currents):
 
 @compiled
 def _store_inputs(inputs, before):
-    """Store the inputs of this period and keep those of the last one.
+    """Store the inputs of this control period in `before` (2, 15) and keep those of the last period.
 
-    Row 0 of `before` (2, 15) receives the last inputs, and row 1 the new ones: coil currents, applied
-    forces and gravity.
+    Row 1 receives the new inputs, and row 0 those that were in row 1. `inputs` are three arrays:
+    coil currents, applied forces and gravity.
     """
     at = 0
     for part in inputs:
@@ -310,10 +314,11 @@ def _store_inputs(inputs, before):
 
 @compiled
 def _set_step_inputs(inputs, before, half_damping, speed, previous_weight):
-    """Set currents, applied forces and gravity of a physics step, and apply half of the damping force.
+    """Set currents, applied forces and gravity of a physics step, with half of the damping force.
 
-    The inputs are a weighted mean of those of the last and of this period (`before`, see
-    `_store_inputs`). `previous_weight` is the weight of the last period.
+    `inputs` are MuJoCo's three arrays, which are written. Their values are a weighted mean of those
+    of the last and of this period (`before`, see `_store_inputs`); `previous_weight` is the weight
+    of the last period. `half_damping @ speed` is subtracted from the applied forces.
     """
     at = 0
     for part in inputs:
@@ -392,9 +397,11 @@ def coil_force_factors(
 def _compute_cab_inertial_forces(mass, com, inertia, mount, w, a, operator_wrench, gravity, out):
     """Compute apparent gravity and inertial forces of a flotor in a frame that rotates about the vertical.
 
+    The flotor is taken at rest in its nominal pose in this frame, without Coriolis forces.
+
     Args:
         mass: of the flotor, scalar [kg].
-        com: (3,) its centre of mass [m].
+        com: (3,) its centre of mass relative to the handle [m].
         inertia: (3, 3) its inertia about the handle [kg m^2].
         mount: (3,) position of the joystick relative to the axis of rotation [m].
         w: angular velocity of the frame, scalar [rad/s].
@@ -466,7 +473,10 @@ def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _place_end_stop_walls(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
-    """Place the six end-stop walls so that the ball at the coils' centre touches them at the end of its travel."""
+    """Place the six end-stop walls where the ball at the coils' centre touches them at the end of travel.
+
+    Raise InputError if the MJCF has no geom for the ball or for a wall.
+    """
     ball, far = spec.geom("gap"), facts.workspace.translation
     walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
               for side, way in (("low", -1.0), ("high", 1.0))}  # fmt: skip

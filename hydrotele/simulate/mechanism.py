@@ -83,7 +83,8 @@ class Mjcf(NamedTuple):
 
         Args:
             path: file to write.
-            final_path: final path of the file, if `path` is temporary; names the asset folder.
+            final_path: path to which the caller will move the file, if `path` is temporary; its
+                stem then names the asset folder.
         """
         folder = (final_path or path).with_suffix("").name + "_assets"
         text = self.text
@@ -98,7 +99,7 @@ Element = ElementTree.Element
 
 
 def remove_visual_geometry(root: Element) -> None:
-    """Remove geoms without contact, unused meshes, materials, cameras and lights, in place.
+    """Remove geoms without contact, unused assets, materials, cameras and lights, in place.
 
     Args:
         root: the `mujoco` element of an MJCF file.
@@ -153,7 +154,11 @@ def _contacts_by_class(root: Element) -> dict[str, bool]:
 
 
 def _remove_visual_elements(body: Element, inherited: str, touching: dict[str, bool]) -> None:
-    """Remove geoms without contact, cameras and lights from a body and its children, in place."""
+    """Remove geoms without contact, cameras and lights from a body and its children, in place.
+
+    `inherited` is the default class of the parent body, and `touching` the result of
+    `_contacts_by_class`.
+    """
     childclass = body.get("childclass", inherited)
     for element in list(body):
         if element.tag == "geom":
@@ -215,7 +220,11 @@ def _add_machine_elements(
     root, machine: Machine, timestep: float, ground: bool, looks: bool,
     surroundings: tuple[SurroundingObject, ...],
 ) -> mjcf.RootElement:  # fmt: skip
-    """Add the elements of the machine file, the surroundings and the scene to the document."""
+    """Add the elements of the machine file, the surroundings and the scene to the MJCF and return it.
+
+    Also remove the bodies of unused tools. `looks` is whether to add visual geometry. Raise
+    InputError for elements of the MJCF that belong in the machine file.
+    """
     root.model = machine.name
     for name in machine.removed_bodies:
         if body := root.find("body", name):
@@ -273,8 +282,36 @@ def mjcf_document(root: mjcf.RootElement) -> Mjcf:
     return Mjcf(root.model, root.to_xml_string(precision=17), root.get_assets())
 
 
+def compile_mechanism(
+    machine: Machine,
+    timestep: float = 1.0e-3,
+    ground: bool = True,
+    visuals: bool = True,
+    surroundings: tuple[SurroundingObject, ...] = (),
+) -> mujoco.MjModel:
+    """Build the MJCF of a machine and compile it.
+
+    Args:
+        machine: the machine, with one tool.
+        timestep: physics step [s].
+        ground: whether the ground can be touched.
+        visuals: whether to include visual geometry.
+        surroundings: objects around the machine.
+
+    Returns:
+        A new model; its end stops and bristle inertias are those of MuJoCo's defaults.
+
+    Raises:
+        InputError: the machine's MJCF cannot be assembled.
+    """
+    return mjcf_document(assemble_mjcf(machine, timestep, ground, visuals, surroundings)).compile()
+
+
 def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
-    """Load the machine's MJCF with attached files; without it, create an empty document."""
+    """Load the machine's MJCF with attached files, or create an empty document if it has no MJCF.
+
+    Visual geometry is removed unless `looks`. Raise InputError if the file cannot be read.
+    """
     if not machine.mjcf:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
@@ -294,7 +331,10 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
 
 
 def _attach_bodies(tree: Element, body: str, file: Path) -> None:
-    """Attach the bodies of another MJCF file, without assets, to a body of a tree, in place."""
+    """Attach the bodies of the MJCF file `file`, without its assets, to the body named `body`, in place.
+
+    Raise InputError if the tree has no such body, or the file no worldbody.
+    """
     place = next((element for element in tree.iter("body") if element.get("name") == body), None)
     world = read_mjcf(file).root.find("worldbody")
     if place is None or world is None:
@@ -351,7 +391,11 @@ def _find_body(root, name: str):
 
 
 def _write_link(root, name: str, link: Link) -> None:
-    """Write inertia, position and joint of a link to its MJCF body; create the body if it is missing."""
+    """Write inertia, position and joint of a link to its MJCF body; create the body if it is missing.
+
+    A link without joint loses the joints of its body. A joint with bending compliance adds two
+    hinges with springs, perpendicular to its axis. Raise InputError if the parent has no body.
+    """
     body = root.find("body", name)
     if body is None:
         parent = _find_body(root, link.parent)
@@ -395,9 +439,9 @@ def _set_inertial(body, mass, com, inertia) -> None:
 
 
 def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep: float) -> None:
-    """Write tube, rod and rod pin of a cylinder to the MJCF; missing bodies are created.
+    """Write tube, rod and rod-pin constraint of a cylinder to the MJCF; create missing bodies.
 
-    `pins` is the direction of the pin axes.
+    `pins` is the direction of the pin axes in the frame of the link at the base pin.
     """
     tube = root.find("body", f"{name}_tube")
     if tube is None:
@@ -446,7 +490,7 @@ def _write_travel(root, machine: Machine, name: str) -> None:
 
 
 def _add_pin(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
-    """Add the two sites and the `connect` constraint of a pin."""
+    """Add the sites of both halves of a pin, on the links of a and b, and the `connect` constraint."""
     for end, pin in (("a", a), ("b", b)):
         _find_body(root, pin.link).add("site", name=pin_site_name(name, end), pos=pin.position, size=(0.03,), group=4)
     root.equality.add(
@@ -477,7 +521,10 @@ def _write_actuators(root, machine: Machine) -> None:
 
 
 def _write_scene(root, ground: bool, looks: bool) -> None:
-    """Add ground, sky and light."""
+    """Add the ground plane, and with `looks` also sky, light and the ground's texture.
+
+    With `ground`, the ground can be touched. Without `ground` and `looks` nothing is added.
+    """
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(
@@ -514,12 +561,16 @@ _MIN_DEFLECTION = 1.0e-9  # m or rad: smaller static deflections count as no loa
 
 
 def drive_joint_name(machine: Machine, axis: str) -> str:
-    """Return the name of the joint that the actuator of an axis acts on: the drive side of a transmission."""
+    """Return the name of the joint that the actuator of an axis acts on.
+
+    It is the drive side `<axis>_drive` of a transmission; without a transmission it is the
+    load-side joint.
+    """
     return f"{axis}_drive" if machine.axes[axis].transmission else load_joint_name(machine, axis)
 
 
 def load_joint_name(machine: Machine, axis: str) -> str:
-    """Return the name of the load-side joint: a cylinder's rod slide, else the axis' joint."""
+    """Return the name of the load-side joint: the rod slide of a cylinder axis, else the axis' joint."""
     facts = machine.axes[axis]
     return f"{axis}_rod" if facts.cylinder else facts.joint
 
@@ -583,7 +634,7 @@ def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[i
 def preload_transmissions(
     machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, force: dict[str, float]
 ) -> None:
-    """Deflect the transmissions so that they carry static forces.
+    """Set the drive sides in `qpos` so that the springs of all transmissions carry static forces.
 
     Args:
         machine: the machine.

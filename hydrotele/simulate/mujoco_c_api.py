@@ -182,9 +182,9 @@ def verify_struct_offsets() -> None:
 
 @intrinsic
 def call_mj_step(typingctx, function, model, data):
-    """Call `mj_step(model, data)` from compiled code, or another C function of these arguments.
+    """Call `mj_step(model, data)`, or another C function of these arguments, from compiled code.
 
-    All arguments are addresses, given as integers.
+    All arguments are addresses, given as integers: of the function, of mjModel and of mjData.
     """
 
     def codegen(context, builder, signature, args):

@@ -51,7 +51,7 @@ def set_state_from_chain(
 
 
 def _cardan_rate_matrix(angles: np.ndarray) -> np.ndarray:
-    """Return the (3, 3) matrix from rates of x-y-z Cardan angles to the body's angular velocity."""
+    """Return the (3, 3) matrix from rates of x-y-z Cardan angles to the angular velocity in body axes."""
     _, b, c = angles
     sb, cb, sc, cc = np.sin(b), np.cos(b), np.sin(c), np.cos(c)
     return np.array([[cb * cc, sc, 0.0], [-cb * sc, cc, 0.0], [sb, 0.0, 1.0]])
@@ -75,7 +75,7 @@ def open_loop_errors(
         force: (n, k) measured forces of the drives [N] or [N m].
         period: time between rows [s].
         horizon: simulated time after which the positions are compared [s].
-        starts: number of start instants, equally spaced over the motion.
+        starts: maximum number of start instants, equally spaced over the motion.
 
     Returns:
         Drive -> RMS position error after the horizon [rad] or [m].

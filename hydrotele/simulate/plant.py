@@ -46,6 +46,7 @@ from hydrotele.simulate.mechanism import (
     add_element,
     assemble_mjcf,
     axes_with_transmission,
+    compile_mechanism,
     drive_joint_name,
     load_joint_name,
     mjcf_document,
@@ -154,13 +155,13 @@ class Plant:
         axes: axis names in actuator order.
         qpos: (nu,) index of each axis' joint in `qpos`.
         dof: (nu,) index of each axis' joint in `qvel`.
-        drive_qpos: (nu,) index of each drive's coordinate in `qpos`: the piston displacement, the
-            rotor's angle, or that of the joint.
-        drive_dof: (nu,) the same in `qvel`.
-        rod_qpos: (nu,) index of the piston displacement in `qpos`, -1 without cylinder.
+        drive_qpos: (nu,) index in `qpos` of the coordinate that each actuator moves: the drive side
+            of a transmission, else the piston displacement of a cylinder, else the joint.
+        drive_dof: (nu,) index of the same coordinates in `qvel`.
+        rod_qpos: (nu,) `drive_qpos` of the axes with a cylinder, -1 for the others.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
-        extra_states: name of each additional state (`parameters.extra_state_names`) -> its index in
-            `act`.
+        extra_states: name of each additional state (`actuator_layout.extra_state_names`) -> its
+            index in `act`.
     """
 
     machine: Machine
@@ -185,7 +186,7 @@ class Plant:
         return self._activations(data)[:, 0]
 
     def pressures(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the head-side and rod-side pressures (h, 2) [Pa], in the order of `axes`.
+        """Return the head- and rod-side pressures (h, 2) of the h hydraulic axes, in the order of `axes` [Pa].
 
         For a motor they are the pressures of its two ports.
         """
@@ -258,8 +259,7 @@ def build_plant(
         RuntimeError: the native hydraulics cannot run with this MuJoCo.
     """
     install_hydraulics()
-    root = assemble_mjcf(machine, timestep, ground, visuals=False, surroundings=surroundings)
-    model = mjcf_document(root).compile()
+    model = compile_mechanism(machine, timestep, ground, visuals=False, surroundings=surroundings)
     set_end_stops(machine, model)
     set_bristle_inertias(machine, model)
     if not _can_have_contacts(model):  # saves the contact search, a tenth of a step
@@ -288,8 +288,8 @@ def build_plant(
 def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
     """Return for each additional state (`extra_state_names`) its index in `act`.
 
-    The bristle state of a force drive is an activation of the actuator of that drive; the others follow after
-    those of the hydraulic axes.
+    The bristle state of a force drive is the first activation of that drive's actuator. All other
+    states follow after the four activations of each hydraulic axis.
     """
     places, first = {}, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes)
     for k, name in enumerate(extra_state_names(machine)):
@@ -300,7 +300,7 @@ def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, i
 
 
 def _can_have_contacts(model: mujoco.MjModel) -> bool:
-    """Return whether any pair of geoms in the model can have a contact."""
+    """Return whether any two geoms of different bodies, or an explicit pair, can have a contact."""
     makes, takes = model.geom_contype, model.geom_conaffinity
     meet = (makes[:, None] & takes[None, :]) | (takes[:, None] & makes[None, :])
     apart = model.geom_bodyid[:, None] != model.geom_bodyid[None, :]
@@ -315,9 +315,9 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
         joints: joint name -> angle [rad] or position [m]; others at home.
 
     Returns:
-        A new MjData. The unloaded chamber of each axis is at REST_PRESSURE (at the accumulator's
-        pressure for an axis with its own pump). The other chamber carries the static load, and
-        transmissions are deflected by it.
+        A new MjData. The unloaded chamber of each hydraulic axis is at REST_PRESSURE, 2 MPa (at the
+        accumulator's pressure for an axis with its own pump). The other chamber carries the static
+        load, and transmissions are deflected by it. `ctrl` of force drives holds the static load.
 
     Raises:
         InputError: the linkages do not close at this position.
@@ -421,10 +421,11 @@ def evaluate_terms(
 
 @compiled
 def _evaluate_term_rows(user, terms, count, gain, time, act, x, v, command, out):
-    """Compute the forces and flows of terms for all rows and write them to `out`, see `evaluate_terms`.
+    """Compute the forces and flows of terms for all rows and write them to `out` (n, nu, 3).
 
-    `user` are the actuator parameters, `terms` the table of terms, `count` the number of hydraulic axes
-    and `gain` (nu,) the force per command of force drives, 0 for others.
+    `user` are the parameters of all actuators, `terms` the table of terms, `count` the number of
+    hydraulic axes and `gain` (nu,) the force per unit of command of force drives, 0 for others. All
+    other arguments and the columns of `out` are those of `evaluate_terms`.
     """
     scratch = np.zeros(SCRATCH_SIZE)
     for row in range(len(time)):
@@ -455,11 +456,11 @@ def term_forces_at_rest(
         machine: the machine.
         data: state at rest.
         drive_qpos: (nu,) indices of the drives in `qpos`.
-        forces: (nu,) forces that hold the machine [N] or [N m]; for terms that depend on pressures
-            they are carried by the head side only.
+        forces: (nu,) drive forces that hold the machine [N] or [N m]. For terms that depend on
+            pressures, the head-side pressure alone is assumed to produce them.
 
     Returns:
-        (nu,) forces [N] or [N m].
+        (nu,) forces that the terms add [N] or [N m]; 0 without terms.
     """
     if not machine.terms:
         return np.zeros(len(forces))

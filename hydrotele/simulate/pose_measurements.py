@@ -51,11 +51,11 @@ class MeasuredPoses(NamedTuple):
 
 
 def default_wires() -> WireGeometry:
-    """Return six wires for measuring poses of the robot IWR, from a hexagon around its rails to three arms.
+    """Return six measuring wires for the robot IWR, from a hexagon around its rails to its platform.
 
-    The hexagon has a radius of 1.5 m and lies 1 m below frame 0 (base), centred at half the length of
-    the rails. The arms are fixed to the platform and have a length of 0.45 m. Of all assignments of arms to
-    corners, this one gives the smallest measurement errors over the workspace.
+    The hexagon has a radius of 1.5 m and lies 1 m below frame 0 (base), centred at half the length
+    of the rails. The arms are fixed to the platform and have a length of 0.45 m. Of all assignments
+    of arms to corners, this one gives the smallest measurement errors over the workspace.
     """
     at = np.arange(LEG_COUNT) * np.pi / 3.0
     corners = np.column_stack([np.full(LEG_COUNT, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
@@ -93,9 +93,10 @@ def sample_poses(
         robot: the robot, without manufacturing errors.
         count: number of poses N.
         rng: random generator.
-        wires: if given, poses that these wires measure with large errors are rejected.
-        reach: largest displacement of the platform along each axis [m].
-        tilt: largest Euler angle [rad].
+        wires: if given, poses are rejected in which the error of any pose coordinate [m] or [rad]
+            exceeds 20 times the error of a wire [m].
+        reach: largest displacement of the platform from its home pose along each axis [m].
+        tilt: largest Euler angle of the platform relative to its home pose [rad].
 
     Returns:
         (joints (N, n), leg readings (N, 6)), all legs within their range.

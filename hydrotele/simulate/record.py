@@ -42,12 +42,12 @@ class Record:
         qvel: (n, nv) velocities.
         qacc: (n, nv) accelerations.
         act: (n, na) activations.
-        command: (n, nu) mean command over the row's interval.
+        command: (n, nu) mean command over the interval of the row, each in its drive's unit.
         contact: (n, 3) total contact force of ground and objects on the machine, world frame [N].
         contact_of: name of each surrounding object -> (n, 3) its force on the machine [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-        delayed_readings: (n, c) delayed and filtered values of `sensed_channels`, without sensor errors; empty
-            (n, 0) if no sensor has a delay or lag.
+        delayed_readings: (n, c) values of `sensed_channels` after delay and lag of the sensors,
+            without other sensor errors; empty (n, 0) if no sensor has a delay or lag.
     """
 
     time: np.ndarray
@@ -79,7 +79,7 @@ def start_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 def current_aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the current positions (nq,), moved back by one step to the time of the activations.
 
-    Positions from the first ball or free joint on (trees and logs) are not aligned.
+    Positions from the first ball or free joint on (trees and logs) are not moved back.
     """
     return align_staggered_positions(model, data.qpos, data.qvel)
 
@@ -87,7 +87,8 @@ def current_aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.
 def align_staggered_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """Return staggered positions (..., nq), moved back by one step with the velocities (..., nv).
 
-    This aligns them with the time of the activations, see the module.
+    The result is at the time of the activations, because MuJoCo's positions are one step later.
+    Positions from the first ball or free joint on are not moved back.
     """
     positions = np.array(qpos)
     rows, rates = positions.reshape(-1, model.nq), qvel.reshape(-1, model.nv)
@@ -127,9 +128,10 @@ def _count_single_dof_joints(kinds):
 
 
 def sensed_channels(plant: Plant) -> tuple[str, ...]:
-    """Return the log channels that a sensor measures: positions, chamber pressures, supply pressure, lengths.
+    """Return the names of the log channels of the sensor values, in the order of compiled code.
 
-    The order is that of the sensor values in compiled code.
+    These are the positions of all axes, head and rod pressure of every hydraulic axis, the supply
+    pressure if there are hydraulic axes, and the lengths of all cylinders.
     """
     machine = plant.machine
     names = [f"{machine.position_kind(axis)}.{axis}" for axis in plant.axes]
@@ -141,7 +143,7 @@ def sensed_channels(plant: Plant) -> tuple[str, ...]:
 
 
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
-    """Split a delay [s] into whole steps and the remaining fraction of a step, in [0, 1) [1]."""
+    """Split a delay [s] into a number of whole steps and the remaining fraction of a step, in [0, 1)."""
     steps = math.floor(delay / timestep + _STEP_TOLERANCE)
     rest = delay / timestep - steps
     return steps, rest if rest > _STEP_TOLERANCE else 0.0
@@ -162,7 +164,7 @@ _WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
 
 @compiled
 def record_row(record, contacts, row, time):
-    """Write the current state, aligned in time, to a row of the recorder's arrays.
+    """Write the current state to a row of the recorder's arrays, aligned to the time of the activations.
 
     Args:
         record: record of a `Recorder`.
@@ -245,7 +247,10 @@ class Recorder:
             raise self.instability_error(row)
 
     def record_sensor_values(self, row: int, delayed_readings: np.ndarray) -> None:
-        """Record the delayed values (c,) of `sensed_channels`, if a sensor has a delay or lag."""
+        """Write the delayed values (c,) of `sensed_channels` to a row.
+
+        Nothing is written if no sensor has a delay or lag.
+        """
         if self.late.shape[1]:
             self.late[row] = delayed_readings
 
@@ -280,7 +285,10 @@ class Recorder:
         self._contacts = make_contact_addresses(model, data, self.geom_groups)
 
     def instability_error(self, row: int) -> SimulationFailed:
-        """Create the exception for an unstable simulation; its message lists the states up to a row."""
+        """Create (not raise) the exception for an unstable simulation.
+
+        Its message lists the states of up to four rows, the last of which is `row`.
+        """
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
             qpos, act = (np.array2string(a[r], precision=4) for a in (self.qpos, self.act))

@@ -120,15 +120,16 @@ def simulate_readings(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray] | None = None, period: float = 0.0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Convert true values to simulated sensor readings with jitter, errors and quantisation.
+    """Convert true values to simulated sensor readings with sampling jitter, errors and quantisation.
 
     Args:
         machine: the machine, with its sensor errors.
         sensors: the sensor set; None for ideal sensors.
         seed: the scenario's seed.
         truth: channel -> (n,) true values; for a sensor with delay or lag, the delayed values
-            (`record.delayed_channels`).
-        errors: channel -> (n,) random errors, if already sampled; others are sampled here.
+            (`true_values.delayed_channels`).
+        errors: channel -> (n,) random errors, if already sampled; those of other channels are
+            sampled here.
         period: time between rows [s], for sampling jitter and drift; values are interpolated
             linearly between rows.
 
@@ -179,7 +180,7 @@ class SensorParameters(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Sampled and held readings of k axes.
+    """Last sampled sensor readings of k axes, held until the next sample.
 
     Attributes:
         joint: (k,) positions [rad] or [m].
@@ -246,7 +247,7 @@ class FeedbackTable(NamedTuple):
         period: time between samples [s].
         sensors: parameters of c sensors.
         errors: (samples, c) random errors and drifts [channel's unit].
-        readings: sampled and held readings.
+        readings: readings of the last sample.
     """
 
     ticks_per_sample: int
@@ -258,12 +259,12 @@ class FeedbackTable(NamedTuple):
 
 @compiled
 def sample_sensors_if_due(table, sim, tick, steps):
-    """Take a new sample if one is due at this control tick; otherwise hold the last one.
+    """Sample all sensors every `ticks_per_sample` control ticks; at other ticks keep the last readings.
 
     Args:
         table: FeedbackTable; its readings are written.
-        sim: Simulation.
-        tick: control tick, scalar.
+        sim: Simulation, from which the true values are read.
+        tick: number of the control tick, from 0, scalar.
         steps: physics steps per tick, scalar.
 
     Returns:
@@ -282,7 +283,7 @@ def sample_sensors_if_due(table, sim, tick, steps):
 
 
 class Feedback:
-    """Sampled and held readings of a plant; `update` refreshes them in place.
+    """Sensor readings of a plant for a controller, held between samples; `update` renews them in place.
 
     Attributes:
         table: sensors, errors and readings for compiled code.
@@ -307,7 +308,7 @@ class Feedback:
         return float(self._supply[0])
 
     def update(self, tick: int, stepper: Stepper) -> None:
-        """Take a new sample if one is due at this control tick; otherwise hold the last one.
+        """Sample all sensors every `ticks_per_sample` control ticks; at other ticks keep the last readings.
 
         Args:
             tick: the control tick, equal to that of the stepper.
@@ -355,7 +356,9 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
 
 
 def periods_per_sample(rate: float, sensors: SensorSet | None) -> int:
-    """Return the number of clock periods per sensor sample; 1 for fast or ideal sensors.
+    """Return the number of clock periods per sensor sample.
+
+    It is 1 for ideal sensors, and for sensors whose rate is at least that of the clock.
 
     Args:
         rate: clock rate [Hz].

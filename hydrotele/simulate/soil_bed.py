@@ -34,7 +34,9 @@ _STRIP_START, _STRIP_END, _CELL_LENGTH = 1.0, 11.0, 0.05  # m, radii from the sw
 
 
 def machine_bucket(machine: Machine) -> Bucket:
-    """Return the digging bucket of a machine: that of the CAT 215, scaled to the distance from pin to edge.
+    """Return the digging bucket of a machine: that of the CAT 215, scaled to the machine's bucket.
+
+    The scale is the ratio of the distances from pin to edge of both buckets.
 
     Raises:
         InputError: the machine has no bucket.
@@ -65,7 +67,8 @@ class SoilBed:
         loose: (m,) thickness of the loose soil on top [m].
         state: state of the bucket; see `soil.parameters`.
         result: result of the last step; see `soil.parameters`.
-        azimuth: direction of the strip [rad]; NaN before the first step.
+        azimuth: horizontal direction of the strip from the swing axis [rad]; NaN before the first
+            step.
     """
 
     def __init__(self, machine: Machine, ground: SoilGround) -> None:
@@ -85,7 +88,7 @@ class SoilBed:
 
     @property
     def cell_radii(self) -> np.ndarray:
-        """Radii of the centres of the cells (m,) [m]."""
+        """Radii (m,) of the centres of the m cells of the profile, from the swing axis [m]."""
         start, length = self.parameters[PROFILE_START], self.parameters[CELL_LENGTH]
         return start + length * (np.arange(len(self.surface)) + 0.5)
 
@@ -96,13 +99,20 @@ class SoilBed:
 
     @property
     def force(self) -> np.ndarray:
-        """Force (3,) of the ground on the bucket, without the weight of the soil carried, in the world [N]."""
+        """Force (3,) of the ground on the bucket in the world frame [N]; 0 before the first step.
+
+        It does not contain the weight of the soil in the bucket.
+        """
         c, s = math.cos(self.azimuth), math.sin(self.azimuth)
         force = np.array([c * self.result[FORCE_R], s * self.result[FORCE_R], self.result[FORCE_Z]])
         return np.nan_to_num(force)
 
     def step(self, edge: np.ndarray, velocity: np.ndarray, ahead: np.ndarray, period: float) -> None:
-        """Advance the soil while the bucket's edge moves through it; updates profile, bucket and force.
+        """Advance the soil while the bucket's edge moves through it.
+
+        Profile, bucket state and result are updated. The first call sets the azimuth of the strip.
+        If the edge is further from the strip's middle than the width of the bucket, only the force
+        is set to 0.
 
         Args:
             edge: (3,) position of the edge in the world [m].

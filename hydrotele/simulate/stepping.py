@@ -158,7 +158,8 @@ def unpack_simulation_record(r):
 def true_sensor_values(sim, out):
     """Compute the true values of the sensed channels, all at the time of the present chamber pressures.
 
-    MuJoCo's positions are one step later than its activations (pressures) and are moved back by one step.
+    MuJoCo's positions are one step later than its activations (pressures); they are moved back by
+    one step.
 
     Args:
         sim: Simulation.
@@ -214,7 +215,7 @@ def compute_delayed_step_commands(line, axes, tick, step, steps, out):
         tick: control tick, scalar.
         step: index of the physics step within the tick, scalar.
         steps: physics steps per tick, scalar.
-        out: (nu,) written [1], or in the drives' units.
+        out: (nu,) written: the commands [1], or in the drives' units.
 
     Returns:
         Nothing.
@@ -234,8 +235,9 @@ def compute_delayed_step_commands(line, axes, tick, step, steps, out):
 def _ring_row(step, steps, tick, length):
     """Return the row of the delay line's ring buffer that holds the command of a physics step.
 
-    `steps` is the number of physics steps per tick, and `length` that of rows. Steps before the start of
-    the run map to row 0.
+    `step` counts from the start of the run. `steps` is the number of physics steps per tick, `tick`
+    the present control tick and `length` the number of rows. Steps before the start of the run map
+    to row 0.
     """
     return (min(max(step // steps, -1), tick) + 1) % length
 
@@ -272,7 +274,10 @@ def step_physics(sim, tick, steps, command):
 
 @compiled
 def _store_sensor_values(sim, number):
-    """Store the sensor values after physics step `number`, with their first-order lags, in the history."""
+    """Store the sensor values after physics step `number` in the history, after their first-order lags.
+
+    The true values before the lags are stored in `before` of the history.
+    """
     past, size = sim.sensor_history, len(sim.sensor_history.before)
     now, last = number % len(past.ring), (number - 1) % len(past.ring)
     values = np.empty(size)
@@ -291,7 +296,7 @@ def apply_sensor_delays(past, number, values):
 
     Args:
         past: SensorHistory.
-        number: number of physics steps so far, scalar.
+        number: number of physics steps since the start of the run, scalar.
         values: (c,) true values; replaced for sensors with delay or lag [channel's unit].
 
     Returns:
@@ -382,7 +387,7 @@ def _step_simulation_record(record, tick, steps, command):
 
 
 class Stepper:
-    """Advances a plant tick by tick; the command is constant within a tick.
+    """Simulation of a plant that advances tick by tick, with a constant command in each control tick.
 
     Args:
         plant: the plant.

@@ -61,7 +61,7 @@ def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject,
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
-    """Add a plate on a spring along its normal."""
+    """Add a plate that slides along its normal on a spring and a damper to the MJCF."""
     normal, thick = np.array(_NORMALS[plate.normal], float), 0.05
     middle = np.array(plate.position) - thick * normal
     body = root.worldbody.add("body", name=name, pos=middle)
@@ -140,7 +140,10 @@ def _add_timber_log_visuals(body, name: str, log: LogOnGround) -> None:
 
 
 def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: str) -> None:
-    """Add stump, stem, crown and root springs of a tree."""
+    """Add a tree to the MJCF: stump, stem, crown, root springs and the weld by which a grab holds it.
+
+    Raise InputError if the machine does not have the tree's saw or grab axis.
+    """
     for part in ("saw", "grab"):
         _check_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position
@@ -178,7 +181,7 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
 
 
 def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return (joint id, its index in `qpos`) of all joints of plates, trees and logs."""
+    """Return (joint id, first index of the joint in `qpos`) for all joints of plates, trees and logs."""
     return [(j, int(model.jnt_qposadr[j])) for j in range(model.njnt) if is_surrounding_object(model.joint(j).name)]
 
 
@@ -228,7 +231,10 @@ class Surroundings:
 
     @property
     def soil_force(self) -> np.ndarray:
-        """Force (3,) of the soil on the machine until the next update, without the weight carried [N]."""
+        """Force (3,) of the soil on the bucket until the next update, in the world frame [N].
+
+        It does not contain the weight of the soil in the bucket.
+        """
         return sum((one.bed.force for one in self._beds), np.zeros(3))
 
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
@@ -265,7 +271,10 @@ class _Gripper:
         self._weld, self._rows, self._grip = model.equality(f"{name}_held").id, model.eq_data, grip
 
     def update(self, data: mujoco.MjData) -> int:
-        """Activate or release the weld that holds the object; return TAKEN, RELEASED or UNCHANGED."""
+        """Activate or deactivate the weld that holds the object, as `grip_step` decides.
+
+        Return TAKEN, RELEASED or UNCHANGED.
+        """
         hand, thing, weld = self._hand, self._thing, self._weld
         change = grip_step(
             self._grip, data.xpos[hand], data.xquat[hand], data.xpos[thing], data.xquat[thing],
@@ -277,7 +286,7 @@ class _Gripper:
 
 
 class _TreeState:
-    """One tree of a run."""
+    """State of one tree during a run: depth of its cut, and whether it is cut off and held."""
 
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: StandingTree) -> None:
         self._model, self._tree, self.name = model, tree, name
@@ -315,7 +324,11 @@ class _TreeState:
         model.geom_contype[self._disc], model.geom_conaffinity[self._disc] = self._solid if on else (0, 0)
 
     def update(self, data: mujoco.MjData, period: float) -> list[str]:
-        """Update cutting and gripping of the tree; return descriptions of new events."""
+        """Update cutting and gripping of the tree; return texts that describe new events.
+
+        The tree counts as cut when the cut is as deep as 98 % of its diameter. `period` is the time
+        since the last call [s].
+        """
         said: list[str] = []
         spin = abs(float(data.qvel[self._spin]))
         data.xfrc_applied[self._saw] = 0.0
@@ -337,7 +350,8 @@ class _TreeState:
     def _advance_cut(self, data: mujoco.MjData, period: float, spin: float) -> None:
         """Deepen the cut up to the edge of the saw disc, and apply cutting torque and feed force to the saw.
 
-        Nothing happens if the disc is not at the height of the cut. `spin` is its speed [rad/s], > 0.
+        Nothing happens if the disc is not at the height of the cut. `spin` is the disc's speed
+        [rad/s], > 0.
         """
         stem, saw = data.xpos[self._body], data.xpos[self._saw]
         axis = data.xmat[self._saw].reshape(3, 3)[:, 2]

@@ -94,7 +94,10 @@ def true_channels(plant: Plant, record: Record) -> tuple[dict[str, np.ndarray], 
 
 
 def _measurable_channels(plant: Plant, record: Record):
-    """Return values and units of the measurable channels: commands, positions and pressures."""
+    """Return the channels of commands, positions, cylinder lengths and chamber pressures.
+
+    The result is (channel -> values (n,), channel -> unit).
+    """
     machine, values, units = plant.machine, {}, {}
     for i, name in enumerate(plant.axes):
         axis = machine.axes[name]
@@ -107,9 +110,9 @@ def _measurable_channels(plant: Plant, record: Record):
 
 
 def _sensed_values(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
-    """Return channel -> (n,) true positions, cylinder lengths and chamber pressures.
+    """Return channel -> (n,) true joint positions, cylinder lengths and chamber pressures.
 
-    They are read from the positions (n, nq) and activations (n, na) of n states.
+    They are read from `qpos` (n, nq) and the activations `act` (n, na) of n states.
     """
     values = {}
     for i, name in enumerate(plant.axes):
@@ -126,7 +129,7 @@ def _sensed_values(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str,
 
 
 def delayed_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
-    """Return the true values after delay and lag of the sensors that have a delay or lag.
+    """Return the values of the channels whose sensors have a delay or lag, after delay and lag.
 
     Args:
         plant: the simulated plant.
@@ -144,7 +147,10 @@ def delayed_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
 
 
 def _unmeasured_channels(plant: Plant, record: Record):
-    """Return values and units of the channels without a sensor: `truth.*`, and the supply pressure."""
+    """Return all `truth.*` channels and the supply pressure.
+
+    The result is (channel -> values (n,), channel -> unit).
+    """
     machine, model = plant.machine, plant.model
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
@@ -205,7 +211,12 @@ def _add_rotation(name: str, quaternions: np.ndarray, put) -> None:
 
 
 def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
-    """Add channels with spools, flows, forces and supply pressure, by calls `put(name, column, unit)`."""
+    """Add channels with spools, flows, forces and supply pressure, by calls `put(name, column, unit)`.
+
+    For an axis with its own pump, pump speed and load pressure replace spool position and spool
+    rate. The forces include friction and terms, the flows no terms. Without hydraulic axes nothing
+    is added.
+    """
     count = plant.hydraulic
     if not count:
         return

@@ -220,8 +220,8 @@ def pack_soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) 
 def make_bucket_state() -> np.ndarray:
     """Return the initial soil state (STATE_SIZE,) of an empty bucket: all zeros.
 
-    The first call of `step_soil` stores the position of the bucket. Zeros written later start again with
-    an empty bucket.
+    The first call of `step_soil` with this state stores the position of the bucket. To start again
+    with an empty bucket, set the array to zeros.
     """
     return np.zeros(STATE_SIZE)
 
@@ -247,9 +247,16 @@ def make_level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.
 
 def total_soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
-    """Return the soil mass [kg]: on the ground above height 0, in the bucket, and fallen off the ends of the profile.
+    """Return the total soil mass [kg], which `step_soil` conserves up to rounding.
 
-    `step_soil` conserves it up to rounding.
+    It consists of the soil on the ground above height 0 (negative below), in the bucket, and fallen
+    off the ends of the profile. Loose soil has the bank density divided by the swell ratio.
+
+    Args:
+        parameters: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
+        surface: (m,) height of the profile [m].
+        loose: (m,) thickness of the loose layer [m].
+        state: (STATE_SIZE,) state of the bucket.
     """
     n = parameters
     thickness = np.sum(surface - loose) + np.sum(loose) / n[SWELL]

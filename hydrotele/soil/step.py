@@ -395,7 +395,9 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
 
 @compile_without_allocation
 def update_elastic_plastic_force(n, state, deflection_index, displacement, rate, low, high):
-    """Return the force of the soil on one surface of the bucket, from an elastic-plastic spring and a damper.
+    """Update the elastic-plastic spring of one surface of the bucket and return the soil's force on it.
+
+    A damper acts in parallel with the spring.
 
     The spring deflects as the surface moves into the soil and yields at the limit forces of soil
     mechanics. The force acts against the displacement.
@@ -430,7 +432,10 @@ def _drop_soil(n, surface, loose, state, first, second, volume):
 
 @compile_without_allocation
 def _widen_sliding_range(state, low, high, count):
-    """Add the cells `low` to `high` and their neighbours to the range in which soil may slide."""
+    """Add the cells `low` to `high` and their neighbours to the range in `state` in which soil may slide.
+
+    `count` is the number of cells of the profile.
+    """
     low, high = max(low - 1, 0), min(high + 1, count - 1)
     if state[LAST_SLIDING_CELL] <= state[FIRST_SLIDING_CELL]:
         state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = low, high
@@ -461,10 +466,15 @@ class EdgeMotion(NamedTuple):
 
 @compile_without_allocation
 def _compute_bucket_forces(n, surface, loose, state, edge, dt, out):
-    """Write the soil force on all surfaces of the bucket and its moment; return the depth of the edge in the soil.
+    """Compute the total soil force on the bucket and its moment, and the depth of the edge in the soil.
+
+    Outward force, upward force [N] and moment about the edge [N m] are written to the first three
+    values of `out`. The deflections and the previous positions in `state` are updated. The other
+    arguments are those of `step_soil`.
 
     Returns:
-        (depth below the soil on the machine's side, depth below the soil on the far side), scalars [m].
+        (depth below the soil on the machine's side, depth below the soil on the far side), scalars
+        [m]; negative if the edge is above the soil.
     """
     r, z, r_rate, z_rate, attitude = edge
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
@@ -539,7 +549,9 @@ def _compute_bucket_forces(n, surface, loose, state, edge, dt, out):
 
 @compile_without_allocation
 def step_soil(n, surface, loose, state, edge, dt, out):
-    """Advance soil and bucket by one time step: force, cutting, filling, spilling and sliding.
+    """Advance profile and bucket by one time step and compute the force of the soil on the bucket.
+
+    The step comprises cutting, filling, spilling and sliding of the soil.
 
     The function allocates nothing and changes only its arguments, so every environment can run in
     its own thread. The force changes smoothly with depth, also between cells.
@@ -551,9 +563,9 @@ def step_soil(n, surface, loose, state, edge, dt, out):
         state: (STATE_SIZE,) state of the bucket from `make_bucket_state`, changed.
         edge: EdgeMotion: position [m], attitude [rad] and velocity [m/s] of the cutting edge.
         dt: time since the previous step, scalar [s].
-        out: (RESULT_SIZE,) written: force outwards and up [N], moment about the edge [N m], mass carried
-            [kg] and its position relative to the edge [m]. The force does not include the weight of
-            the soil carried.
+        out: (RESULT_SIZE,) written: force outwards and up [N], moment about the edge [N m], mass
+            carried [kg] and its position relative to the edge [m]. The force does not include the
+            weight of the soil carried.
 
     Returns:
         Nothing.
@@ -620,14 +632,14 @@ def step_soil(n, surface, loose, state, edge, dt, out):
 
 @compile_without_allocation
 def compute_bucket_wrench(out, edge, theta, centre, wrench):
-    """Compute the wrench of the soil and of the carried load on the bucket's body.
+    """Compute the wrench of the soil and of the carried load on the bucket's body, in the world frame.
 
     Args:
         out: (RESULT_SIZE,) result of `step_soil` [N], [N m], [kg], [m].
         edge: (3,) position of the edge in the world [m].
         theta: azimuth of the edge about the swing axis, scalar [rad].
-        centre: (3,) centre of mass of the bucket's body, `xipos` [m].
-        wrench: (6,) written: force and torque in the world, `xfrc_applied` [N], [N m].
+        centre: (3,) centre of mass of the bucket's body in the world, `xipos` [m].
+        wrench: (6,) written: force, and torque about `centre`, as for `xfrc_applied` [N], [N m].
 
     Returns:
         Nothing.

@@ -44,8 +44,8 @@ def surface_height(n, surface, r):
 def cut_cells(n, surface, loose, r0, z0, r1, z1):
     """Remove the soil above the path of the bucket's edge from the cells that the edge sweeps in a step.
 
-    A partly swept cell has the mean height of its cut and uncut parts. A further sweep removes the
-    corresponding fraction of the uncut part.
+    A partly swept cell gets the mean height of its cut and uncut parts. When the edge later sweeps
+    on in this cell, the corresponding fraction of the uncut part is removed.
 
     Args:
         n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
@@ -128,7 +128,11 @@ def find_cell_at_radius(n, r):
 
 @compile_without_allocation
 def slide_soil_between_cells(n, surface, loose, upper, lower):
-    """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
+    """Let soil slide from one cell to its lower neighbour, in place.
+
+    Loose soil slides until the slope between the cells is the angle of repose. If the upper cell
+    then has no loose soil and the slope exceeds the cut slope, the bank breaks off down to the cut
+    slope. Height differences of less than MIN_SLIDING_HEIGHT above the stable one remain.
 
     Args:
         n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
@@ -173,8 +177,8 @@ def slide_soil_in_range(n, surface, loose, low, high, wall):
         loose: (m,) loose part of them, changed [m].
         low: index of the first cell, scalar [1].
         high: index of the last cell, scalar [1].
-        wall: index of the cell that contains the bucket, where no soil slides, -2 for none, scalar
-            [1].
+        wall: index of the cell that contains the bucket, -2 for none; no soil slides into or out of
+            it, scalar [1].
 
     Returns:
         Whether soil has moved.

@@ -73,8 +73,9 @@ def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[
 def _assign_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
     """Write coordinate, sign and gain of every task coordinate to the row of its joystick axis.
 
-    Raise InputError for a coordinate that the arm does not have, an axis with two coordinates, or an
-    axis whose dead band covers its whole range.
+    Under rate control the gain is the full speed over the handle's range beyond the dead band
+    [1/s], under position control the scale. Raise InputError for a coordinate that the arm does not
+    have, an axis with two coordinates, or an axis whose dead band covers its whole range.
     """
     where = "pilot.coordinates"
     if strange := set(pilot.coordinates) - set(coordinates):
@@ -96,9 +97,10 @@ def _assign_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> N
 
 
 def _merge_gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
-    """Return stiffness, damping and limits of joystick axis `name`, with the scenario's replacements.
+    """Return stiffness, damping and limits of joystick axis `name`.
 
-    Raise InputError for invalid values of the scenario.
+    The values are those of the joystick file's gain set that the scenario selects. Values that the
+    scenario gives for this axis replace them. Raise InputError for invalid values of the scenario.
     """
     usual = joystick.gains[pilot.gains][name].model_dump()
     own = {str(axis): gains for axis, gains in pilot.stiffness.items()}.get(name, {})

@@ -32,12 +32,13 @@ class TeleopFindings:
         analyses: one analysis per structure.
         delays: (n,) delays of the map in each direction [s].
         factors: (m,) factors of the map on the return channels [1].
-        maps: structure -> (m, n), true where stable.
+        maps: structure -> (m, n) map, true where the linear analysis predicts stability.
         spring: joystick axis with stiffness feedback, None without.
         sweeps: simulated sine sweeps, empty if not requested.
         agreements: predicted and simulated maps, empty if not requested.
-        robustness_results: robustness of every sampled structure, empty if not requested.
-        period: sampling period [s].
+        robustness_results: robustness of every structure, analysed with time sampling; empty if not
+            requested.
+        period: sampling period of the robustness results [s]; 0 without them.
     """
 
     name: str
@@ -68,7 +69,8 @@ def analyse_structures(
         spring: joystick axis with stiffness feedback, None without.
         confirm: whether to simulate sine sweeps, with and without the case's delays, and every cell
             of the map.
-        progress: called with the structure and the completed fraction.
+        progress: called before the analysis of each structure, with its name and the fraction of
+            the structures that are completed.
 
     Returns:
         Results of all structures.

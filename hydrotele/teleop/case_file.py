@@ -188,7 +188,7 @@ class StiffnessFeedbackAxis(StrictModel):
         return self
 
     def to_stiffness_axis(self) -> StiffnessAxis:
-        """Convert the data of the file to a `StiffnessAxis`, which tests whether it is stable."""
+        """Convert the data of the file to a `StiffnessAxis`, whose properties test stability."""
         return StiffnessAxis(self.mass, self.damping, self.nominal_stiffness, self.min_stiffness, self.max_stiffness)
 
 
@@ -236,6 +236,8 @@ class TeleopCaseFile(StrictModel):
     Slave and task are scaled to the lengths and forces of the master. `structures` are the control
     structures to compare, `stiffness` an optional joystick axis with stiffness feedback. `hands` and
     `tasks` are ranges for random sampling, `map` is the range of the stability map.
+    `wave_impedance` [N s/m] belongs to the structure with wave variables; 0 selects the slave
+    controller's damping.
     """
 
     renamed = {"wave": "wave_impedance"}

@@ -37,9 +37,9 @@ class Coils:
 
     Attributes:
         position: (6, 3) centres of the coils in the flotor's frame [m].
-        direction: (6, 3) unit vectors of the coil forces.
-        force_per_ampere: force per current [N/A].
-        max_current: limit of each coil in both directions [A].
+        direction: (6, 3) unit vectors of the coil forces in the flotor's frame.
+        force_per_ampere: force per current of every coil [N/A].
+        max_current: limit of the magnitude of each coil's current [A].
     """
 
     position: np.ndarray
@@ -99,8 +99,8 @@ class Coils:
             wrench: (6,) force [N] and torque about the frame's origin [N m].
 
         Returns:
-            The currents, and whether the wrench was scaled down. They are zero for a wrench that is
-            not finite.
+            The currents, and whether the wrench was scaled down. For a wrench that is not finite
+            the currents are zero and count as scaled down.
 
         Source: Zhu 1994, chapter 5 (force to coil currents).
         """

@@ -64,10 +64,10 @@ class FlotorMotion:
     """Pose and velocity of the flotor.
 
     Attributes:
-        position: (3,) origin of the coils' frame [m].
-        quaternion: (4,) orientation, scalar first.
-        velocity: (3,) velocity of the origin [m/s].
-        angular_velocity: (3,) angular velocity, in its own axes [rad/s].
+        position: (3,) position of the coils' frame (its origin), world axes [m].
+        quaternion: (4,) orientation, coils' frame to world, scalar first.
+        velocity: (3,) velocity of that origin, world axes [m/s].
+        angular_velocity: (3,) angular velocity, in the axes of the coils' frame [rad/s].
     """
 
     position: np.ndarray
@@ -214,8 +214,8 @@ def compliance_wrench(
         axes: natural frequencies and damping ratios of the six systems.
         centre: (3,) point T in the coils' frame [m].
         motion: pose and velocity of the flotor.
-        target: (3,) reference position of T [m].
-        target_rotation: (4,) reference orientation, quaternion, scalar first.
+        target: (3,) reference position of T, world axes [m].
+        target_rotation: (4,) reference orientation of the flotor, quaternion, scalar first.
         gravity: (3,) acceleration of gravity, world axes [m/s^2].
 
     Returns:

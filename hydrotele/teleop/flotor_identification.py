@@ -155,9 +155,10 @@ def build_flotor_regression(
 
 
 def _differentiation_errors(value: np.ndarray) -> np.ndarray:
-    """Return the errors (10,) of the parameters due to derivatives by difference quotients.
+    """Return the absolute errors (10,) of the parameters due to the use of difference quotients.
 
-    They hold for motions up to 6 Hz that are sampled at 200 Hz.
+    They hold for motions up to 6 Hz that are sampled at 200 Hz. `value` (10,) are the parameters:
+    mass [kg], centre of mass [m] and inertia about the centre of mass [kg m^2].
     """
     moment = value[4:7].sum() / 2.0
     radius = float(np.sqrt(moment / value[0]))
@@ -165,7 +166,10 @@ def _differentiation_errors(value: np.ndarray) -> np.ndarray:
 
 
 def _relative_rotation(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-    """Return the rotation vector (3,) between two orientations, in the body's axes [rad]."""
+    """Return the rotation vector (3,) [rad] from the orientation `first` to `then`, in body axes.
+
+    Both are quaternions (4,), scalar first; the rotation is by at most 180 degrees.
+    """
     scalar, vector = relative_quaternion(first, then)
     size = float(np.linalg.norm(vector))
     return vector * (2.0 * np.arctan2(size, scalar) / size if size > 1e-12 else 2.0)
@@ -180,9 +184,10 @@ def _skew_matrices(v: np.ndarray) -> np.ndarray:
 
 
 def _inertia_regressor(v: np.ndarray) -> np.ndarray:
-    """Return matrices (n, 3, 6) that multiply xx, yy, zz, xy, xz, yz of an inertia I to give I v.
+    """Return the matrices (n, 3, 6) with which the product I v is linear in the inertia I.
 
-    v (n, 3) are the vectors.
+    Each matrix times the elements xx, yy, zz, xy, xz, yz of I gives I v; `v` (n, 3) are the
+    vectors.
     """
     out = np.zeros((len(v), 3, 6))
     for row, places in enumerate(_INERTIA_INDICES):
@@ -196,10 +201,11 @@ def _inertia_matrix(six: np.ndarray) -> np.ndarray:
 
 
 def _move_to_centre_of_mass(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert mass, first moments and inertia about the coils' frame to those about the mass centre.
+    """Convert the ten linear parameters of the flotor to mass, centre of mass and inertia about it.
 
-    Return the parameters (10,) mass, centre of mass and inertia about it, and their Jacobian (10, 10)
-    with respect to the given ones, by central differences.
+    `linear` (10,) are mass [kg], first moments of mass [kg m] and inertia about the origin of the
+    coils' frame [kg m^2]. Return mass [kg], centre of mass [m] and inertia about the centre of mass
+    [kg m^2] as (10,), and their Jacobian (10, 10) with respect to `linear`, by central differences.
     """
 
     def convert_parameters(p: np.ndarray) -> np.ndarray:

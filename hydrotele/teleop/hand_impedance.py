@@ -19,13 +19,13 @@ from hydrotele.teleop.operator_parameters import (
 def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folder: str = "") -> Joystick:
     """Return a copy of the joystick with the hand impedance of the scenario's operator.
 
-    Grip, posture and co-contraction of the settings change the impedance; without them the hand of the
-    joystick file is used.
+    A grip replaces the hand of the joystick file. A posture sets its horizontal mass and stiffness
+    ellipses. Co-contraction multiplies its stiffness by a factor, at the same damping ratio.
 
     Args:
         joystick: the joystick.
         perception: operator settings of the scenario (key `perception`).
-        folder: folder of the scenario, to which its file is relative.
+        folder: folder of the scenario, to which the path of the operator file is relative.
 
     Returns:
         The joystick with the operator's hand.
@@ -54,6 +54,10 @@ def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folde
 
 def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> HandImpedance:
     """Return a copy of a hand with the horizontal mass and stiffness ellipses of an arm's posture.
+
+    The arm's mass and stiffness matrices in this posture are divided by the square root of the
+    determinant that they have in the reference posture. They are stored as `mass_shape` and
+    `stiffness_shape` of the hand, factors on its mass and stiffness.
 
     Args:
         hand: hand with the grip's parameters.
@@ -126,7 +130,8 @@ def arm_impedance(arm: ArmParameters, hand_position: tuple[float, float]) -> tup
 def scale_hand_stiffness(hand: HandImpedance, factor: float) -> HandImpedance:
     """Return a copy of a hand with `factor` times the stiffness and the same damping ratio.
 
-    Antagonist muscles that contract together add stiffness and damping but no force (Hogan 1984).
+    The damping is multiplied by the square root of `factor`; the mass is kept. Antagonist muscles
+    that contract together add stiffness and damping but no force (Hogan 1984).
 
     Args:
         hand: mass [kg], damping [N s/m] and stiffness [N/m].

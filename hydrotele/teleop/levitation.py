@@ -72,7 +72,7 @@ class CoilOutput(NamedTuple):
 
     Attributes:
         currents: (6,) coil currents [A].
-        is_limited: whether the currents were scaled down.
+        is_limited: whether the currents were scaled down, or are off.
         is_blind: whether the coils are off because the reading is not finite or is frozen.
     """
 
@@ -88,7 +88,8 @@ def make_levitation_control(
 
     Args:
         joystick: the joystick.
-        body: model of the flotor in the control; the true parameters by default.
+        body: model of the flotor that the control uses; by default the flotor of the joystick's
+            file, which the simulation uses as well.
         max_frozen_time: maximum time for which a reading may be exactly constant [s].
 
     Returns:
@@ -110,7 +111,10 @@ def make_levitation_control(
 
 
 def initial_controller_state() -> ControllerState:
-    """Return the state of the levitation controller before its first reading: NaN pose, no time."""
+    """Return the state of the levitation controller before its first reading.
+
+    The pose is NaN, and the time for which the reading has not changed is 0.
+    """
     return ControllerState(np.full(3, np.nan), np.full(4, np.nan), 0.0)
 
 
@@ -156,7 +160,7 @@ def step_levitation(
 
 
 def coil_frame_position(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Return the position of the coils' frame (3,) [m] for a pose of the handle.
+    """Return the position (3,) of the coils' frame (its origin) [m], world axes, for a handle pose.
 
     Args:
         handle: (3,) the handle's point in the coils' frame [m].
@@ -183,8 +187,8 @@ class LevitationRun:
         place: (n, 3) measured position of the coils' frame, from the handle's centre [m].
         quaternion: (n, 4) measured orientation, scalar first.
         currents: (n, 6) held from this reading until the next [A].
-        limited: (n,) whether the currents were scaled down.
-        blind: (n,) whether the coils were off because of an invalid reading.
+        limited: (n,) whether the currents were scaled down, or off.
+        blind: (n,) whether the coils were off because the reading was not finite or was frozen.
         warnings: number of MuJoCo warnings of all kinds.
     """
 
@@ -201,8 +205,9 @@ class LevitationRun:
 class PoseSensor:
     """Simulated sensor of the flotor's pose, with resolution and noise.
 
-    By default the position of the handle and the rotation vector are rounded to the resolution, as
-    in `teleop.master`. With diodes, the three beams are traced instead.
+    By default noise is added to the position of the handle and the rotation vector, and both are
+    rounded to the resolution. With diodes, noise and rounding apply to the six readings of the
+    three light beams instead, and the pose is computed from the readings.
     """
 
     def __init__(self, joystick: Joystick, *, noise: float, diodes: bool, seed: int) -> None:
@@ -274,7 +279,8 @@ def simulate_levitation(
         cab_motion: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab
             about its swing axis; a fixed mount if omitted.
         handle_wrench: (n, 6) forces [N] and torques [N m] on the handle.
-        sensor_fault: function that applies a sensor fault to the reading of a period.
+        sensor_fault: function of the number of the period and the pose reading, which returns the
+            faulty reading.
 
     Returns:
         Time histories of the run.

@@ -80,9 +80,9 @@ class StructureAnalysis:
         unstable_poles_free: number of unstable poles without a task.
         unstable_poles_released: number of unstable poles with the task, with the handle released.
         unstable_poles_released_free: number of unstable poles without a task, with the handle released.
-        gain_margin: factor on the return channels up to which the loop stays stable. It is below 1
-            if the case is unstable, 0 if no factor stabilises it, and infinite if no tested factor
-            makes it unstable.
+        gain_margin: factor on the return channels (from slave to master) up to which the loop stays
+            stable; infinite if no tested factor makes it unstable. For an unstable case it is the
+            largest factor below 1 that stabilises it, 0 if none does.
         max_delay: delay in each direction up to which the loop stays stable [s]; 0 if it is
             unstable without delay, infinite if it is stable with the largest tested delay of 10 s.
         has_passive_port: whether the two-port is passive, so that no passive hand and task destabilise it.
@@ -219,10 +219,11 @@ def _count_poles_or_none(port: TwoPort, hand: Block, environment: Block) -> int 
 
 
 def find_gain_margin(case: StabilityLoop, structure: str) -> float:
-    """Return the factor on the return channels (from slave to master) at which stability changes [1].
+    """Return the factor on the return channels (slave to master) at which stability changes [1].
 
-    For a stable case it is the largest stable factor, infinite if all factors up to 1000 are stable.
-    For an unstable case it is below 1, and 0 if no factor down to 0.001 stabilises it.
+    For a stable case it is the largest stable factor, infinite if all factors up to 1000 are
+    stable. For an unstable case it is the largest factor below 1 with which the loop is stable, and
+    0 if no factor down to 0.001 stabilises it.
     """
 
     def is_stable_with(factor: float) -> bool:
@@ -238,7 +239,8 @@ def find_gain_margin(case: StabilityLoop, structure: str) -> float:
 def find_max_delay(case: StabilityLoop, structure: str) -> float:
     """Return the delay in each direction up to which the loop is stable [s].
 
-    It is 0 if the loop is unstable without delay, and infinite if it is stable up to 10 s.
+    It is 0 if the loop is unstable without delay or with 0.1 ms, and infinite if it is stable up to
+    10 s. Both directions have the same delay.
     """
 
     def is_stable_with(delay: float) -> bool:

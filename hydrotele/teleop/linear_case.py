@@ -181,8 +181,8 @@ def _tip_mass_and_lever_arms(arm: ArmBalance, row: int) -> tuple[float, np.ndarr
 def _joint_oil_stiffness(arm: ArmBalance, valve: int) -> float:
     """Return the stiffness of a joint due to the oil in its drive's chambers [N m/rad].
 
-    The pose is the present one of the model `arm`. Air in the oil is neglected: it lowers the stiffness
-    in a way that depends on the unknown pressures.
+    The pose is the present one of the model `arm`, and `valve` is the number of the drive. Air in
+    the oil is neglected: it lowers the stiffness in a way that depends on the unknown pressures.
     """
     user = arm.model.user[valve * SLOT_COUNT : (valve + 1) * SLOT_COUNT]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
@@ -239,11 +239,12 @@ def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, 
 
 
 def _drive_frequency_responses(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
-    """Return three frequency responses (..., k) of the k drives at complex frequencies s (...).
+    """Return three frequency responses of the k drives at complex frequencies s (...).
 
-    They are: valve velocity per command, with the command's delay [1]; the delay of half a sensor
-    sample [1]; and the gain of the servo's pressure feedback with its high-pass filter and the two
-    other responses [1/s].
+    The first (..., k) is the velocity that the valve flow produces per commanded velocity, with the
+    command's delay [1]. The second (..., 1) is the delay of half a sensor period [1]. The third
+    (..., k) is the gain of the servo's pressure feedback with its high-pass filter, times the first
+    and the second response [1/s].
     """
     at = s[..., None]
     valve = tip.bandwidth**2 / (at**2 + 2.0 * tip.damping * tip.bandwidth * at + tip.bandwidth**2)
@@ -296,12 +297,12 @@ class LinearCase:
 
     @property
     def force_limit(self) -> float:
-        """Machine force at which the reflected force stops to increase [N], [N m]."""
+        """Machine force above which the reflected force no longer increases [N], [N m]."""
         return float(self.axis_parameters[MAX_REFLECTED_FORCE])
 
     @property
     def deadband(self) -> float:
-        """Displacement of the handle up to which nothing is commanded [m], [rad]."""
+        """Handle displacement up to which no rate is commanded under rate control [m], [rad]."""
         return float(self.axis_parameters[DEADBAND])
 
     @property
@@ -338,7 +339,8 @@ class LinearCase:
     def hand(self, s: np.ndarray) -> np.ndarray:
         """Return the hand's impedance [N s/m], [N m s/rad] at complex frequencies [rad/s].
 
-        The spring of an operator who controls a force follows the handle after the reflex delay.
+        An operator who controls a force moves the rest position of the arm's spring to the handle's
+        position after the reflex delay. The spring force then vanishes for slow motions.
         """
         if not self.operator_controls_force:
             return self.hand_impedance(s)
@@ -403,16 +405,17 @@ class LinearCase:
     def _commanded_velocity(self, rate: bool, s: np.ndarray) -> np.ndarray:
         """Return the commanded tip velocity per velocity of the handle, as a frequency response.
 
-        It is an integrator under rate control (`rate` true), otherwise a second-order low-pass filter.
+        It is the gain of the axis times an integrator under rate control (`rate` true), otherwise
+        times a second-order low-pass filter.
         """
         if rate:
             return self.axis_parameters[GAIN] / s
         return self.axis_parameters[GAIN] * (SMOOTHING_BANDWIDTH / (s + SMOOTHING_BANDWIDTH)) ** 2
 
     def _centring_impedance(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Return the impedance of the coils' spring to the centre and damper, with sampling delays.
+        """Return the impedance of the coils' centring spring and damper, with delays [N s/m].
 
-        Under position control (`rate` false) there is no spring.
+        Under position control (`rate` false) there is no spring, only the damper.
         """
         held = np.exp(-0.5 * self.periods.control_period * s)
         return held * (
@@ -420,21 +423,22 @@ class LinearCase:
         )
 
     def _coupling_impedance(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
-        """Return the force on the hand per velocity error of the machine, if they are coupled.
+        """Return the force on the hand per difference of commanded and actual tip velocity [N s/m].
 
-        With the reflection `coordinating_force`, a spring and a damper act on the difference between
-        commanded and actual tip position. The force is held for `period` [s]; by default for the sum of the
-        control and the sensor period.
+        This is the impedance of the spring and damper of the reflection `coordinating_force`, which
+        act on the difference between commanded and actual tip position. The force is held for
+        `period` [s]; by default for the sum of the control and the sensor period.
         """
         scale = 1.0 if rate else 1.0 / self.axis_parameters[GAIN]
         held = np.exp(-0.5 * (period or self.periods.control_period + self.periods.sensor_period) * s)
         return scale * held * (self.axis_parameters[COUPLING] / s + self.axis_parameters[COUPLING_DAMPING])
 
     def _reflected_force_response(self, s: np.ndarray) -> np.ndarray:
-        """Return the reflected force before scaling per contact force, as a frequency response [1].
+        """Return the frequency response from contact to reflected force, without the ratio [1].
 
-        It has the delays of sensor sample and control period, and the two filters with which the contact
-        force is estimated. An exactly known force has only the delay of the control period.
+        It contains the delays of half a sensor period and half a control period, and the two
+        filters with which the contact force is estimated. An exactly known force has only the delay
+        of the control period.
         """
         held = np.exp(-0.5 * self.periods.control_period * s)
         if self.pilot.force == "true":
@@ -451,8 +455,8 @@ def build_linear_case(
     """Build the linear loop of one task coordinate from joystick, machine and environment.
 
     Args:
-        pilot: teleoperation settings of the scenario.
-        joystick: the joystick.
+        pilot: teleoperation settings of the scenario, of which the channel gives the delays.
+        joystick: the joystick; its hand holds the handle.
         numbers: parameters of the master's control.
         tip: linear tip model along the coordinate.
         servo: gains of the servo.

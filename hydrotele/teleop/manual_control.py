@@ -86,7 +86,7 @@ def make_visual_loop(
         margin: required phase margin [rad]; by default `tracking_margin` of the operator.
         threshold: error below which the operator does not act.
         max_output: maximum displacement of the hand.
-        steps: number of noise samples before they repeat.
+        steps: number of decisions after which the noise samples repeat.
 
     Returns:
         Parameters and initial state of the loop.
@@ -137,8 +137,8 @@ def update_controlled_element_fits(loop, tick, late, seen):
 
     Hand and output pass through a third-order high-pass (wash-out) of bandwidth a, so that slow drift
     does not count. A candidate with n integrations and lag T then predicts the output, for unit gain,
-    as the hand displacement filtered by `s^(3-n) / (s + a)^3 / (T s + 1)`. The best candidate is
-    selected.
+    as the hand displacement filtered by `s^(3-n) / (s + a)^3 / (T s + 1)`. The candidate whose
+    scaled prediction leaves the smallest part of the output's power unexplained is selected.
 
     Args:
         loop: VisualLoop; `hand`, `output_filter`, `sums` and `state` are written.
@@ -219,12 +219,15 @@ def estimate_controlled_element_gain(loop):
 def decide_hand_reference(loop, tick, target, seen, hand):
     """Run one visual decision of the operator: compute the hand's reference from the observed error.
 
-    The model of the controlled element is updated first; its gain scales the action.
+    The model of the controlled element is updated first. The observed error is delayed and noisy.
+    The action is the error, integrated for an element without integration or with lead for a double
+    integrator, times the operator gain over the estimated gain of the element. A delayed error
+    below the threshold causes no action.
 
     Args:
         loop: VisualLoop, written.
         tick: number of the decision, scalar.
-        target: present reference of the output, scalar.
+        target: present reference of the element's output, scalar.
         seen: present output, scalar.
         hand: present displacement of the hand, scalar.
 
@@ -376,9 +379,11 @@ def make_sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float 
 
 @compiled
 def _simulate_tracking(loop, lag, form, gain, target, fine, hand, response):
-    """Simulate operator and controlled element in a closed loop; write `hand` and `response`.
+    """Simulate operator and controlled element in a closed loop; write `hand` and `response` (n,).
 
-    `lag` is the discrete neuromuscular lag, and `fine` the number of steps per decision.
+    `hand` is the displacement of the hand, `response` the output of the element with `form`
+    integrations and gain `gain`. `target` (n,) is the reference of the output. `lag` is the
+    discrete neuromuscular lag, and `fine` the number of steps per decision.
     """
     place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
     step = loop.parameters[STEP] / fine
@@ -440,10 +445,10 @@ def simulate_tracking(
 
 
 class CrossoverProperties(NamedTuple):
-    """Properties of the open loop of operator and controlled element around its crossover frequency.
+    """Properties of the open loop of operator and controlled element near its crossover frequency.
 
     Attributes:
-        frequency: frequency of unit gain [rad/s].
+        frequency: crossover frequency, at which the gain of the open loop is 1 [rad/s].
         margin: phase margin [rad].
         slope: slope of the gain around the crossover [dB per decade].
     """

@@ -120,8 +120,8 @@ class MasterState(NamedTuple):
     """State of the master's control, updated every period.
 
     Attributes:
-        handle: (6,) measured displacement [m] and rotation vector [rad].
-        speed: (6,) its rate.
+        handle: (6,) measured displacement of the handle [m] and its rotation vector [rad].
+        speed: (6,) rate of `handle` [m/s], [rad/s].
         push: (6,) force of the coils on the handle, without the flotor's weight [N], [N m].
         stiffness: (6,) stiffness of every axis [N/m], [N m/rad].
         hand: (6,) estimated force of the hand [N], [N m].
@@ -134,9 +134,10 @@ class MasterState(NamedTuple):
         extra: (6,) additional force on the handle, such as tip-over protection [N], [N m].
         limited: (1,) factor by which the currents were scaled down; 1 if not, 0 if they are off
             because the reading is not finite.
-        energy: (2,) energy from the hand into the handle [J]: present value, and minimum so far.
-        line: (6, 10) end of a passive channel: 8 elements of `passive_line`, then the signal and the
-            energy for the next packet.
+        energy: (2,) energy that the hand has supplied to the handle since the start [J]: present
+            value, and minimum so far.
+        line: (6, 10) master's end of a passive channel for every handle axis: 8 elements as in
+            `teleop.passive_channel`, then the signal and the energy for the next packet.
     """
 
     handle: np.ndarray
@@ -257,9 +258,9 @@ def unpack_master_state(flat):
 def measure_handle(parameters, qpos, period, s):
     """Measure the handle's displacement, its rate, and the energy that the hand has supplied.
 
-    The displacement is rounded to the sensing resolution, and the rate is its difference. The energy
-    follows from the kinetic energy and the work of the coils, without the lag of the estimated hand
-    force.
+    The displacement is rounded to the sensing resolution. The rate is the difference of two
+    successive displacements over the period. The energy follows from the change of kinetic energy
+    and the work of the coils, and not from the estimated hand force, which lags.
 
     Args:
         parameters: MasterParameters.
@@ -383,9 +384,10 @@ def compute_reflected_forces(parameters, packet, packet_gain, period, s):
 
 @compiled
 def _coordinating_force(row, mode, packet, period, s, i):
-    """Return the coordinating force of handle axis i: a spring and damper to the machine [N], [N m].
+    """Return the coordinating force of handle axis i, a spring-damper to the machine [N], [N m].
 
-    They act on the difference between the machine's motion and that which the handle commands.
+    They act on the motion that the handle commands minus the measured motion of the tip. The force
+    is positive against the handle's positive direction; the caller subtracts it.
     """
     gain, x, v, c, sign = row[GAIN], s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
     place, speed = sign * packet[TIP_POSITION, c], sign * packet[TIP_SPEED, c]
@@ -402,8 +404,8 @@ def _coordinating_force(row, mode, packet, period, s, i):
 def _passive_channel_force(numbers, row, packet, period, s, i):
     """Return the force of a passive channel against the motion of handle axis i [N], [N m].
 
-    A passive channel uses wave variables or passivity control. What the next packet must contain is
-    written to the state: sum of the waves or handle position, and the energy sent so far.
+    A passive channel uses wave variables or passivity control. The content of the next packet is
+    written to the state: time integral of the waves or handle position, and the energy sent so far.
     """
     c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
     total, budget = sign * packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c]
@@ -422,8 +424,10 @@ def _passive_channel_force(numbers, row, packet, period, s, i):
 def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
     """Return the force on handle axis i with four channels: reflected force and motion coupling.
 
-    Under rate control the reflected force is the derivative of the contact force divided by the rate
-    gain, so that a constant force is not felt. The derivative has a bandwidth of 20 rad/s.
+    The reflected force is the contact force times the reflection ratio. Under rate control it is
+    the derivative of this product divided by the rate gain, so that a constant force is not felt;
+    the derivative has a bandwidth of 20 rad/s. The coupling is a spring and damper between the
+    motion that the handle commands and that of the machine.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
     x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
@@ -441,9 +445,10 @@ def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
 
 @compiled
 def _decoupled_wrench(numbers, turn, s, wrench):
-    """Compute the coil wrench (6,) with which every handle axis moves as an independent mass.
+    """Compute the coil wrench with which every handle axis moves as an independent mass.
 
-    Each axis is driven by its own force in `s.push`; `turn` is the rotation matrix, flotor to world.
+    The force of each axis in `s.push` accelerates only this axis. `turn` is the rotation matrix,
+    flotor to world. The wrench (6,) [N], [N m] is written to `wrench`.
     """
     mass, arm = numbers.mass[0], numbers.centre_of_mass - numbers.handle
     inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
@@ -501,7 +506,7 @@ def drive_coils(parameters, quaternion, period, s):
 
 @compiled
 def _reset_master(s):
-    """Set currents, handle motion and forces to 0 after an invalid reading.
+    """Set currents, handle motion, forces and the factor `limited` to 0 after an invalid reading.
 
     The next valid reading starts from rest.
     """
@@ -515,7 +520,7 @@ def _reset_master(s):
 def step_master(parameters, qpos, packet, packet_gain, period, first, s):
     """Run one control period of the master: measure the handle, reflect forces, drive the coils.
 
-    A reading that is not finite switches the coils off and leaves the machine without a command.
+    A reading that is not finite switches the coils off; handle displacement and forces become 0.
 
     Args:
         parameters: MasterParameters.

@@ -20,17 +20,17 @@ class NeuromuscularState(NamedTuple):
     Attributes:
         reference: (6,) reference displacement of the handle [m], [rad].
         spring: (6,) expected stiffness of the joystick [N/m], [N m/rad].
-        detent: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside [N/m], < 0
-            without a detent.
-        correction: (6,) learnt additional force [N], [N m].
-        force: (6,) force on the handle [N], [N m].
+        detent: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside the edge
+            [N/m], [N m/rad], negative without a detent.
+        correction: (6,) additional force, the integral of the delayed position error [N], [N m].
+        force: (6,) force of the muscles on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
         cross: (1,) coupling stiffness of the arm between x and y [N/m].
         max_force: (6,) maximum force [N], [N m].
         weight: (6,) weight of the hand, which the muscles carry [N], [N m].
         gain: (1,) integral gain of the correction [1/s].
         rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
-        rate: (6,) its rate.
+        rate: (6,) rate of `rest` [m/s], [rad/s].
         lag: (6,) discrete neuromuscular lag for one control period, from `discretise_neuromuscular_lag`.
     """
 
@@ -81,11 +81,17 @@ def unpack_neuromuscular_state(flat):
 
 @compiled
 def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
-    """Compute the muscle forces on the handle in one control period from its reference displacement.
+    """Compute the muscle forces on the handle in one control period from the handle's reference.
+
+    The rest position of the arm follows the reference through the neuromuscular lag. The force
+    deflects the springs of arm and joystick to the rest position. A correction, which integrates
+    the delayed position error, and tremor are added. The force is limited, and the weight of the
+    hand is added.
 
     Args:
-        muscles: NeuromuscularState. The result is `force`, the force on the handle; `rest` and `rate` (rest
-            position of the arm and its rate) and `correction` (learnt force) are updated.
+        muscles: NeuromuscularState. The result is `force`, the force on the handle; `rest` and
+            `rate` (rest position of the arm and its rate) and `correction` (integrated force) are
+            updated.
         history: (d + 1, 6) ring buffer of handle displacements for a reflex delay of d periods,
             written [m], [rad].
         tremor: (n, 6) tremor forces [N], [N m].

@@ -16,7 +16,7 @@ _WHERE_STABILITY = "stability"
 
 
 class PoleOnAxisError(InputError):
-    """Error: a pole lies on the imaginary axis, so that unstable poles cannot be counted."""
+    """Error that is raised if a pole on the imaginary axis prevents counting the unstable poles."""
 
 
 def count_unstable_poles(
@@ -85,8 +85,10 @@ def is_stable(port: TwoPort, hand: Block, environment: Block) -> bool:
 def _count_unstable_zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
     """Count the zeros in the right half-plane of a function that has poles only at 0.
 
-    The winding of the phase along the imaginary axis gives the number (argument principle); `lowest`
-    and `highest` limit the frequencies [rad/s].
+    The winding of the phase along the imaginary axis gives the number (argument principle).
+    `lowest` is the frequency below which no zeros are expected, `highest` the end of the path
+    [rad/s]. `least_order` is the minimum power of s with which the function grows; a lower one
+    raises InputError. Raise PoleOnAxisError if the phase is not resolved.
     """
     shift = _CONTOUR_OFFSET * lowest
     order = _growth_order(function, highest, least_order)
@@ -115,9 +117,10 @@ def _count_unstable_zeros(function: Block, lowest: float, highest: float, least_
 
 
 def _growth_order(function: Block, highest: float, least: int) -> int:
-    """Return the power of s with which a function grows for large real s, where delays vanish.
+    """Return the power of s with which a function grows for large real s, without delayed terms.
 
-    Raise InputError if it is below `least`.
+    It is evaluated from 100 to 1000 times the frequency `highest` [rad/s]. Raise InputError if it
+    is below `least`.
     """
     far = highest * np.array([1e2, 1e3], complex)
     sizes = np.abs(function(far))

@@ -73,7 +73,9 @@ class ParameterEstimate(NamedTuple):
         low: lower end of the 95 % confidence interval.
         high: upper end of the interval.
         unit: unit of all three.
-        identified: whether the record determines the value to a factor of about 2.7.
+        identified: whether the record determines the value: the standard error of its logarithm is
+            at most 0.5, and the fit did not stop at a bound of the parameter. For crossover and
+            margins the ratio of `high` to `low` has the corresponding limit, about 11.
     """
 
     value: float
@@ -89,8 +91,9 @@ class OperatorFit(NamedTuple):
     Attributes:
         equalisation: `gain`, `lead`, `lag` or `integral`.
         estimates: name -> estimate: gain (hand per error), delay, time_constant of lead or lag,
-            neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
-            gain_margin if the controlled element is one of the known forms.
+            neuromuscular_frequency, neuromuscular_damping, remnant (noise-to-signal ratio). If the
+            controlled element is one of the known forms, also crossover (frequency), phase_margin
+            and gain_margin (loop gain at -180 degrees).
         element: form of the controlled element, such as `K/s`; empty if it is not a known form.
         explained_fraction: fraction of the hand's variance that the model predicts from the target [1].
         rate: sampling rate of the analysis [Hz].
@@ -179,8 +182,9 @@ def identify_operator(record: TrackingRecord, equalisation: str | None = None, s
 
     Args:
         record: record as sampled.
-        equalisation: `gain`, `lead`, `lag` or `integral`, the form of the operator's compensation; by
-            default the best fit is selected.
+        equalisation: `gain`, `lead`, `lag` or `integral`, the form of the operator's compensation.
+            By default the converged fit with the smallest Bayesian information criterion is
+            selected.
         source: name of the record in messages.
 
     Returns:
@@ -285,7 +289,7 @@ def _estimate_instrumental_variable(
     This part contains none of the operator's own noise (remnant). The impulse response from target to
     the error `seen` is fitted by least squares to the rows in `kept`. Each part of the record uses the
     response that is fitted to the other parts, so that its own remnant has no influence (jackknife
-    instrumental variables, Angrist et al. 1999).
+    instrumental variables, Angrist et al. 1999). Return this part of the error, (n,).
     """
     apart = max(1, round(_TAP_SPACING / step))
     lags = np.arange(0, round(_RESPONSE_LENGTH / step), apart)
@@ -332,7 +336,11 @@ def _operator_response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray
 
 
 def _response_derivatives(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
-    """Return the derivatives of the describing function Yp by the logarithms of its parameters."""
+    """Return the derivatives of the describing function Yp by the logarithms of its parameters.
+
+    The list has one array per parameter, with the shape of the complex frequencies `s`. `kind` is
+    the form of the operator's compensation.
+    """
     p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     whole = _operator_response(kind, logs, s)
@@ -355,7 +363,8 @@ def _predict_hand_motion(data: _TrackingData, kind: str, logs: np.ndarray, value
 def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
     """Fit an autoregression to a noise and return the filter that makes the noise white.
 
-    Its coefficients are 1, followed by the negative autoregression coefficients.
+    The filter is returned as its coefficients (taps): 1, followed by the negative autoregression
+    coefficients. It spans 0.6 s; `step` is the sampling period [s].
     """
     from scipy.linalg import solve_toeplitz
 
@@ -371,7 +380,10 @@ def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
 def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None:
     """Fit the operator model with one form of equalisation by refined instrumental variables.
 
-    The fit starts from the best of several delays. Return None if the hand does not respond.
+    The fit starts from the best of several delays. It repeats two steps: fit the filter that
+    whitens the unexplained hand motion, and solve the instrumental-variable equations for a
+    parameter step. The criterion of the result is the Bayesian information criterion of the hand
+    motion that the target-caused error does not explain. Return None if the hand does not respond.
     """
     from scipy.optimize import least_squares
     from scipy.signal import lfilter
@@ -498,7 +510,7 @@ def _build_operator_fit(
     """Build the user's result from a fit of the operator model.
 
     It contains all estimates with intervals: parameters, the operator's noise (remnant), crossover
-    frequency and stability margins.
+    frequency and stability margins. Warnings for the user are appended to `notes`.
     """
     errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     estimates: dict[str, ParameterEstimate] = {}
@@ -569,8 +581,10 @@ def _estimate_crossover(
 ) -> str:  # fmt: skip
     """Identify the controlled element K, K/s or K/s^2 and add crossover and margins to `estimates`.
 
-    Their intervals follow from samples of the fitted parameters. Return the form of the element, empty
-    if none fits; then nothing is added.
+    The element's form, gain and delay are those that predict the response from the hand with the
+    smallest squared error. The intervals of crossover frequency and margins follow from random
+    samples of the fitted operator parameters. Return the form of the element. It is empty if more
+    than 20 % of the response's power is unexplained; then nothing is added to `estimates`.
     """
     first, hand = round(_SETTLING_TIME / data.step), signals["hand"]
     best = (math.inf, 0, 1.0, 0.0)

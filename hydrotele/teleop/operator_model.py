@@ -109,9 +109,10 @@ class OperatorModel:
         displacement_history: (d + 1, 6) ring buffer of recent handle displacements, for a reflex delay
             of d periods [m], [rad].
         ticks_per_decision: control ticks per decision.
-        estimated_force: (decisions,) contact force that the operator estimates [N]; NaN if it is not
-            relevant.
-        loops: coordinate -> visually closed loop with the learnt element.
+        estimated_force: (decisions,) contact force that the operator estimates at each decision
+            [N]; NaN if the operator does not control a force.
+        loops: number of a task coordinate -> parameters and state of the loop that the operator
+            closes by vision along this coordinate.
     """
 
     def __init__(
@@ -130,11 +131,12 @@ class OperatorModel:
             ticks: number of control periods.
             period: control period [s].
             seed: seed of the run.
-            hand: input of a live operator.
+            hand: function that returns the handle reference of a live operator; None for a
+                simulated one.
             folder: folder of the scenario, to which file names are relative.
 
         Raises:
-            InputError: a live operator without a hand, or an invalid file.
+            InputError: a live operator without an input, or an invalid file.
         """
         if isinstance(pilot.operator, LiveOperator) and hand is None:
             message = "a live operator needs an input device: use hydrotele drive SCENARIO"
@@ -198,9 +200,10 @@ class OperatorModel:
         )  # fmt: skip
 
     def decide_handle_reference(self, tick: int) -> None:
-        """Choose the handle's reference displacement until the next decision.
+        """Write the handle's reference displacement until the next decision to `muscles`.
 
-        It is written to `muscles`.
+        It follows a given path or a live input, or it results from the control of the contact force
+        or of the tip's position.
 
         Args:
             tick: number of the control tick, a multiple of `ticks_per_decision`.
@@ -220,8 +223,11 @@ class OperatorModel:
     def _control_contact_force(self, tick: int, approach: float) -> None:
         """Move the handle so that the contact force approaches its target.
 
-        Before contact the handle moves to the fraction `approach` of its range. In contact the force is
-        read from a display, felt at the handle, or imagined from the operator's own pushes.
+        Before contact the handle moves beyond the dead band by the fraction `approach` of the
+        remaining range. In contact the operator reads the force from a display, feels it at the
+        handle, or imagines it from earlier pushes. A directly reflected force without a display is
+        opposed by a hand force; in all other cases short pushes of the handle correct the contact
+        force.
         """
         press, number = self._target, tick // self.ticks_per_decision
         axis, row, wanted = press.axis, press.axis_parameters, self.muscles.reference
@@ -370,9 +376,10 @@ class OperatorModel:
     def _push_with_target_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Push the handle with the hand force that balances the reflected force at the target.
 
-        It is the target contact force `goal` [N] times the reflection ratio, in the direction `way`,
-        and is built up gradually. The position reference follows the handle's position at the tick
-        `reflex`, so that the operator controls a force and no position.
+        The hand force is the target contact force `goal` [N] times the reflection ratio, in the
+        direction `way`, and is built up gradually. It is written to the muscles' `correction`. The
+        position reference follows the handle's position at the tick `reflex`, so that the operator
+        controls a force and no position. `axis` is the joystick axis, and `row` are its parameters.
         """
         share = 1.0 - math.exp(-self._step / _FORCE_BUILDUP_TIME)
         wish = way * row[REFLECTION_RATIO] * goal
@@ -381,9 +388,10 @@ class OperatorModel:
         self.muscles.reference[axis] = self._handle[reflex, axis]  # force control
 
     def _displacement_beyond_deadband(self, axis: int, tick: int) -> float:
-        """Return the handle displacement that commands motion, with the sign of the coordinate [m], [rad].
+        """Return the handle displacement that commands motion, in the coordinate's sign [m], [rad].
 
-        Under rate control it is the displacement beyond the dead band, otherwise the whole displacement.
+        It is that of joystick axis `axis` in the control tick `tick`. Under rate control it is the
+        displacement beyond the dead band, otherwise the whole displacement.
         """
         row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
         if self._pilot.mode == "rate":
@@ -391,7 +399,11 @@ class OperatorModel:
         return float(row[SIGN]) * x
 
     def _steer_tip(self, tick: int) -> None:
-        """Choose handle references that move the tip to its targets, by visual control."""
+        """Write the handle references that move the tip to its target positions, by visual control.
+
+        Under rate control the handle is moved to the edge of the dead band plus the operator's
+        action, or to 0 if no position error is noticed.
+        """
         before, number = tick - 1, tick // self.ticks_per_decision
         for c, goals in self._goals.items():
             axis, loop = _find_joystick_axis(self._numbers, c), self.loops[c]
@@ -418,7 +430,7 @@ class _ForceEstimate:
         push_gain: change of the force per displacement and time of a push [N/(m s)].
         push_gain_variance: variance of `push_gain`.
         last_push: displacement times time of the last push [m s].
-        previous_force: estimated force before the last push [N].
+        previous_force: force that was perceived at the previous update [N].
     """
 
     force: float
@@ -432,9 +444,11 @@ class _ForceEstimate:
         self._expected = self.push_gain
 
     def update(self, judged: float, variance: float) -> None:
-        """Update force and push gain with a perceived force [N] and its variance [N^2].
+        """Update the estimates of force and push gain with a perceived force and its variance.
 
-        The change since the previous force is attributed to the last push.
+        `judged` is the perceived force [N], `variance` that of its error [N^2]. Its change since
+        the previous update is attributed to the last push and corrects the push gain. The force is
+        then predicted with the push and corrected by the perceived force.
         """
         if self.last_push and math.isfinite(self.previous_force):
             own = self.last_push**2 * self.push_gain_variance
@@ -550,7 +564,8 @@ def _make_arm_at_rest(
 def _colour_noise(white: np.ndarray, band: float, period: float) -> np.ndarray:
     """Filter white noise (n, ...) with a first-order low-pass of bandwidth `band` [rad/s].
 
-    The result has unit standard deviation.
+    The result is scaled so that unit white noise gives unit standard deviation. `period` is the
+    time between two samples [s].
     """
     share = 1.0 - math.exp(-band * period)
     scale = math.sqrt((2.0 - share) / share)

@@ -109,16 +109,17 @@ class Operator:
         neuromuscular_damping: damping ratio of limb and reflexes [1].
         remnant: power density of the observation noise over pi times the variance of the observed
             quantity.
-        visual_threshold: visual position threshold [m] or [rad].
-        display_noise: reading noise of a display, relative to its largest value.
+        visual_threshold: position error below which the operator does not act [m] or [rad].
+        display_noise: standard deviation of the reading of a display, relative to its largest
+            value.
         haptic_delay: delay from touch to motion [s].
         force_weber: relative standard deviation of a felt force.
         position_weber: relative standard deviation of a felt displacement.
         integration_weber: additional relative standard deviation of a felt stiffness.
         tremor: standard deviation of the muscles' force [N].
         handle_position_gain: integral gain of the handle's position control [1/s].
-        max_force: maximum force [N].
-        cocontraction: co-contraction, relative to its maximum.
+        max_force: maximum muscle force on the handle [N].
+        cocontraction: simultaneous contraction of antagonist muscles, relative to its maximum.
         cocontraction_stiffness_factor: factor on the arm stiffness at full co-contraction.
         expected_speed: machine speed that the operator expects with the handle at its stop [m/s],
             [rad/s].
@@ -127,7 +128,8 @@ class Operator:
         task_stiffness: expected ground stiffness [N/m].
         new_gain_log_std: standard deviation of the logarithm of an unknown gain.
         memory_time: time constant with which experience fades [s].
-        unfelt_gain_std: relative error of the imagined effect of a push that is not felt.
+        unfelt_gain_std: standard deviation of the logarithm of the imagined effect of a push that
+            is not felt.
         correction_interval: time between correcting pushes by feel [s].
     """
 
@@ -201,9 +203,12 @@ def load_operator_file(path: Path = DEFAULT_OPERATOR_FILE) -> OperatorFile:
 def make_operator(file: OperatorFile, number: int | None, **fixed_parameters: float) -> Operator:
     """Create an operator from a file: the nominal one, or a random one within the ranges.
 
+    Each parameter of a random operator has a triangular distribution with its mode at the nominal
+    value.
+
     Args:
         file: result of `load_operator_file`.
-        number: number of the sampled operator, which is reproducible; None for the nominal one.
+        number: number of the sampled operator, used as seed; None for the nominal operator.
         fixed_parameters: parameters with given values, which are not sampled.
 
     Returns:
@@ -224,7 +229,7 @@ def make_scenario_operator(perception: OperatorSettings, folder: str = "") -> Op
 
     Args:
         perception: operator settings of the scenario (key `perception`).
-        folder: folder of the scenario, to which its file is relative.
+        folder: folder of the scenario, to which the path of the operator file is relative.
 
     Returns:
         The operator.
@@ -238,7 +243,10 @@ def make_scenario_operator(perception: OperatorSettings, folder: str = "") -> Op
 
 
 def load_perception_file(perception: OperatorSettings, folder: str) -> OperatorFile:
-    """Load the operator file that a scenario names, or the default file."""
+    """Load the operator file that a scenario names, or the default file if it names none.
+
+    The path is relative to `folder`, the folder of the scenario.
+    """
     if perception.file is None:
         return load_operator_file()
     return load_operator_file(resolve_path(Path(folder, perception.file)))

@@ -95,7 +95,10 @@ def pose_resolution(distance: float, reading_resolution: float) -> np.ndarray:
 def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
     """Return the diode readings (6,) [m] of a pose, and their Jacobian (6, 6).
 
-    The Jacobian's columns are the position and a small rotation about the stator's axes.
+    `place` (3,) [m] and `turn` (3, 3) are displacement and rotation matrix of the flotor.
+    `distance` is the distance of the diodes from the centre [m]. The Jacobian's columns are the
+    derivatives by the position and by a small rotation about the stator's axes. Raise InputError if
+    a beam misses its diode's side.
     """
     readings, slope = np.empty(6), np.empty((6, 6))
     for k, (out, aside) in enumerate(zip(_BEAM_DIRECTIONS, _LATERAL_DIRECTIONS, strict=True)):

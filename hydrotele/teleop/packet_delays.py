@@ -13,9 +13,10 @@ from hydrotele.core.errors import InputError
 
 
 def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
-    """Return for every period the age of the newest packet that has arrived.
+    """Return for every period the age of the newest packet that has arrived so far.
 
-    A packet that arrives after a newer one is dropped.
+    The age is the number of periods since the packet was sent. A packet that arrives after a
+    later-sent one is dropped.
 
     Args:
         delays: (n,) delays, in whole periods, of the packets sent in periods 0 .. n - 1; negative if
@@ -39,6 +40,8 @@ def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
 
 def compute_ages_on_arrival(delays: np.ndarray) -> np.ndarray:
     """Return for every period the age of the arriving packet, if it is newer than the one in use.
+
+    The age is the number of periods since the packet was sent.
 
     Args:
         delays: (n,) delays, in whole periods, of the packets sent in periods 0 .. n - 1; negative if

@@ -45,9 +45,10 @@ _CATCH_UP_RATE = 2.0  # 1/s, rate at which a limited reference catches up
 
 @compiled
 def take_received_wave(wave_integral, wave_energy, period, end_state):
-    """Return the received wave for this period: all sent waves minus those that were already used.
+    """Return the received wave of this period, from the sent waves that were not yet used.
 
-    It is limited so that no more energy is used than was sent.
+    It is the time integral of these waves divided by the period, limited so that no more energy is
+    used than was sent. The used wave integral and energy are added up in the state.
 
     Args:
         wave_integral: time integral of all waves that the other end had sent, from the newest packet, scalar
@@ -162,10 +163,11 @@ def step_passivity_master(v, force, slave_energy, mass, period, end_state):
 
 @compiled
 def _power_dissipating_force(v, force, power, most):
-    """Return a damping force against the speed v that dissipates the power `power` [W].
+    """Return a force [N] against the motion at speed v that dissipates the power `power` [W].
 
-    If the received force `force` dissipates more, it is returned instead. The magnitude of the result is
-    at most `most` [N s/m] times the speed.
+    The force has the sign of v and acts against it. If the received force `force` dissipates more,
+    it is returned instead. The magnitude of the result is at most `most` [N s/m] times the speed;
+    it is 0 at rest.
     """
     speed = abs(v)
     if speed == 0.0:

@@ -21,7 +21,8 @@ class PerceptionErrors(NamedTuple):
     Attributes:
         force: (n,) factor on the perceived force.
         displacement: (n,) factor on the perceived displacement.
-        stiffness: (n,) factor due to the combination of both.
+        stiffness: (n,) additional factor on a perceived stiffness, due to the combination of force
+            and displacement.
         stiffness_deviation: relative standard deviation of a perceived stiffness, known to the operator [1].
     """
 

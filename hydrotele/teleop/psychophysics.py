@@ -61,8 +61,10 @@ class PsychometricFunction(NamedTuple):
 def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
     """Simulate an operator who moves a handle with stiffness `spring` and opposing force `load`.
 
-    Force [N] and position [m] of the handle in every period are written to `felt` (n, 2). `first` is
-    the index of the first tremor sample.
+    The operator is given by `muscles` (NeuromuscularState with the reference displacement), the
+    ring buffer `past` of handle displacements and the tremor forces `tremor`; `first` is the index
+    of the first tremor sample. The force of the hand on the handle [N] and its position [m] in
+    every period are written to `felt` (n, 2).
     """
     mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
     step = _PERIOD / _SUBSTEPS
@@ -104,8 +106,8 @@ def measure_discrimination(
     Args:
         operator: parameters of the operator.
         hand: parameters of the hand on the handle.
-        sense: compared quantity: the handle's stiffness, or a constant opposing force.
-        reference: reference stiffness [N/m] or force [N].
+        sense: compared quantity: `stiffness` of the handle, or a constant opposing `force`.
+        reference: reference stiffness [N/m] or force [N], with which all levels are compared.
         trials: number of trials per level.
         seed: seed of the trials.
 
@@ -143,7 +145,8 @@ def measure_discrimination(
 def _mean_perception(handle: np.ndarray, errors: PerceptionErrors, sense: ComparedQuantity) -> float:
     """Return the mean perceived stiffness [N/m] or force [N] in the second half of an exploration.
 
-    `handle` (n, 2) is force [N] and position [m] in every decision.
+    `handle` (n, 2) is force [N] and position [m] in every decision; `errors` are the operator's
+    perception errors.
     """
     felt = []
     for number in range(len(errors.force) // 2, len(errors.force)):
@@ -172,7 +175,8 @@ def fit_psychometric_function(
         levels: (n,) stimulus levels of the comparison.
         greater: (n,) number of trials in which the comparison was reported as greater.
         trials: number of trials per level.
-        lapse: fraction of wrong responses at either end that are independent of the level.
+        lapse: lower limit of the fitted probability of the response "greater", and distance of its
+            upper limit from 1, for responses that do not depend on the level.
 
     Returns:
         Mean and standard deviation of the normal, and standard error of the standard deviation, all in

@@ -90,7 +90,8 @@ class ZWidth:
         clamped_impedance: (n,) transmitted impedance with a clamped slave [N s/m].
         max_stiffness_held: maximum stable task stiffness with the hand on the handle [N/m]; infinite if
             all tested values are stable, 0 if the softest is unstable.
-        max_stiffness_released: maximum stable task stiffness with the handle released [N/m].
+        max_stiffness_released: maximum stable task stiffness with the handle released [N/m];
+            infinite or 0 likewise.
         max_tested_stiffness: largest tested stiffness [N/m].
     """
 
@@ -153,7 +154,7 @@ def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndar
 
 
 def port_with_task(case: TeleoperatorAxis, structure: str, task: Impedance) -> TwoPort:
-    """Return the linear two-port of a control structure for a teleoperator that acts on `task`."""
+    """Return the linear two-port of a control structure for a copy of the case with `task`."""
     return replace(case, task=task).make_port(structure)
 
 
@@ -214,8 +215,9 @@ class ImpedanceRanges:
     """Ranges of hand and task impedances for random sampling, log-uniform between two impedances.
 
     Attributes:
-        hand: minimum and maximum impedance of the hand [kg], [N s/m], [N/m].
-        task: minimum and maximum impedance of the task.
+        hand: impedances with minimum and with maximum mass [kg], damping [N s/m] and stiffness
+            [N/m] of the hand.
+        task: the same for the task.
     """
 
     hand: tuple[Impedance, Impedance]
@@ -281,11 +283,11 @@ class SampledStability:
     Attributes:
         pair_count: number of sampled pairs of hand and task.
         unstable_count: number of unstable pairs with the hand on the handle.
-        unstable_released_count: number of unstable tasks with the handle released.
-        worst_growth_rate: growth rate of the worst pair with the hand on the handle, negative if
-            motions decay [1/s].
-        worst_hand: hand of the worst pair.
-        worst_task: task of the worst pair.
+        unstable_released_count: number of pairs whose task is unstable with the handle released.
+        worst_growth_rate: largest growth rate of all pairs with the hand on the handle, negative if
+            all motions decay [1/s].
+        worst_hand: hand of the pair with this growth rate.
+        worst_task: task of this pair.
     """
 
     pair_count: int
@@ -306,18 +308,20 @@ def evaluate_random_hands_and_tasks(
 ) -> SampledStability:
     """Evaluate the stability of a structure with randomly sampled hands and tasks.
 
-    The stability test includes time sampling and the variable delays of the channel.
+    Every pair is tested with the hand on the handle and with the handle released. The test includes
+    time sampling and the variable delays of the channel. The worst pair has the largest growth
+    rate.
 
     Args:
-        case: the teleoperator.
-        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        case: the teleoperator; its hand and task are replaced.
+        structure: one of `sampled_stability.SAMPLED_STRUCTURES`.
         line: control period, and distribution of the ages of received packets.
         spread: ranges of hands and tasks.
         pairs: number of sampled pairs; the same seed gives the same pairs for every structure.
         seed: seed of the random generator.
 
     Returns:
-        Number of unstable pairs, and the worst pair.
+        Numbers of unstable pairs, and the worst pair with its growth rate.
 
     Raises:
         InputError: the structure is not known.
@@ -368,11 +372,11 @@ def evaluate_robustness(
     spread: ImpedanceRanges,
     pairs: int = 20,
 ) -> Robustness:
-    """Evaluate the robustness of a control structure against other hands, tasks and release.
+    """Evaluate the robustness of a control structure against other hands and tasks, and release.
 
     Args:
         case: the teleoperator.
-        structure: one of `sampled.SAMPLED_STRUCTURES`.
+        structure: one of `sampled_stability.SAMPLED_STRUCTURES`.
         line: control period, and distribution of the ages of received packets.
         spread: ranges of hands and tasks.
         pairs: number of sampled pairs of hand and task.

@@ -1,10 +1,10 @@
-"""Time simulation of a sampled teleoperator, packet by packet, to check `sampled`.
+"""Time simulation of a sampled teleoperator, packet by packet, to check `sampled_stability`.
 
 Master with hand and slave with task are integrated with many steps per period. In every period each
 side measures, sends a packet and uses the newest packet that has arrived. Packets have individual
 delays, may overtake each other and may be lost. The simulation uses no polynomials, means or
-predictions of `sampled`. Waves and passivity control are the nonlinear laws of the teleoperated
-scenarios (`passive_line`).
+predictions of `sampled_stability`. Waves and passivity control are the nonlinear laws of the
+teleoperated scenarios (`passive_channel`).
 """
 
 import math
@@ -46,11 +46,11 @@ class KickResponse(NamedTuple):
     """Response of a sampled teleoperator to initial velocities of master and slave.
 
     Attributes:
-        max_speeds: (40,) maximum of the sum of both speeds in each fortieth of the run [m/s]; 0 after
-            an early stop.
-        is_growing: whether late motion is larger than early motion; under passivity control, which
-            bounds motions without damping them, whether it has more kinetic energy than at the
-            start.
+        max_speeds: (40,) maximum of the sum of master's and slave's speed magnitudes in each
+            fortieth of the run [m/s]; 0 after an early stop.
+        is_growing: whether the largest speed late in the run exceeds that early in the run by more
+            than 5 %. Under passivity control, which bounds motions without damping them: whether
+            the late kinetic energy exceeds that at the start by more than 5 %.
         line_energy: (periods,) energy that has entered the channel at both ends [J]; 0 for the six
             structures without waves or passivity control.
     """
@@ -61,15 +61,19 @@ class KickResponse(NamedTuple):
 
     @property
     def has_decayed(self) -> bool:
-        """Whether the speeds at the end of the run are below a thousandth of the initial speed."""
+        """Whether the last speeds of the run are below a thousandth of the master's initial speed.
+
+        The last speeds are the last positive element of `max_speeds`.
+        """
         return bool(self.max_speeds[self.max_speeds > 0.0][-1] < 1e-3 * _INITIAL_SPEEDS.max())
 
 
 def control_coefficients(case: TeleoperatorAxis, structure: str, return_gain: float = 1.0) -> np.ndarray:
     """Return the control laws of a structure as coefficients on seven sampled signals of each side.
 
-    The signals are sum of positions, position, its difference, acceleration, sum and difference of the
-    force on hand or task, and that force.
+    The signals are the time integral of the position, position, its difference quotient,
+    acceleration, time integral and difference quotient of the force on hand or task, and that
+    force.
 
     Args:
         case: the teleoperator.
@@ -120,10 +124,10 @@ def simulate_initial_velocities(
 
     Args:
         case: teleoperator with hand and task; its delays are replaced by the given delays.
-        structure: one of `sampled.SAMPLED_STRUCTURES`.
-        period: T of both sides [s].
-        delays_forward: (n,) delay of the packet sent in each of the n periods of the run [s]; NaN
-            if lost.
+        structure: one of `sampled_stability.SAMPLED_STRUCTURES`.
+        period: control period of both sides [s].
+        delays_forward: (n,) delay of the master's packet that is sent in each of the n periods of
+            the run [s]; NaN if lost.
         delays_back: (n,) the same for the slave's packets [s].
         return_gain: factor on the return channels [1].
 
@@ -161,10 +165,11 @@ _MIN_GROWTH_RATIO = 1.05  # ratio of late to early motion above which motion gro
 
 
 def _is_growing(largest: np.ndarray) -> bool:
-    """Return whether speeds grow: the maximum of a run's last quarter exceeds that of its second one.
+    """Return whether the speeds of a run grow.
 
-    `largest` (40,) are the maximum speeds of the parts of the run.
-    After an early stop the last speed is compared with the initial one.
+    `largest` (40,) are the maximum speeds of the parts of the run. Speeds grow if the maximum of
+    the last quarter of the run exceeds that of the second quarter by more than 5 %. After an early
+    stop the last speed is compared with the initial one.
     """
     reached = int(np.count_nonzero(largest > 0.0))
     if reached < _BLOCKS:
@@ -174,7 +179,11 @@ def _is_growing(largest: np.ndarray) -> bool:
 
 
 def _has_gained_energy(largest: np.ndarray, given: float) -> bool:
-    """Return whether the late kinetic energies of a run exceed the initial one, `given` [J]."""
+    """Return whether the kinetic energy late in a run exceeds the initial one by more than 5 %.
+
+    `largest` (40,) are the maximum kinetic energies of the parts of the run [J], of which the last
+    ten before its stop are used. `given` is the initial kinetic energy [J].
+    """
     late = largest[largest > 0.0][-_BLOCKS // 4 :]
     return bool(late.max() > _MIN_GROWTH_RATIO * given)
 
@@ -183,9 +192,15 @@ def _has_gained_energy(largest: np.ndarray, given: float) -> bool:
 def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, first):
     """Integrate master and slave over all n periods, with one packet in each direction per period.
 
-    `way` selects linear control laws, wave variables or passivity control. Return the largest speeds
-    (40,) [m/s] and kinetic energies (40,) [J] of the parts of the run, and the energy that has entered
-    the channel (n,) [J].
+    `way` selects linear control laws, wave variables or passivity control; `table` (4, 7) are the
+    coefficients of a linear law. `bodies` (2, 6) are mass, damping and stiffness of each side and
+    of hand or task. `numbers` are period, stiffness and damping of the slave's controller, and wave
+    impedance. `age_forward` and `age_back` (n,) are the ages of the packets in use, in periods;
+    `first` (2,) are the initial speeds.
+
+    The run stops early when speeds have decayed or grown beyond limits. Return the largest speeds
+    (40,) [m/s] and kinetic energies (40,) [J] of the parts of the run, and the energy that has
+    entered the channel (n,) [J].
     """
     count = len(age_forward)
     period = numbers[0]
@@ -233,8 +248,10 @@ def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, fi
 def _sample_side_signals(body, state, force, period, seen):
     """Update the sampled signals `seen` (7,) of master or slave from its state.
 
-    They are position, its sum and difference, acceleration, the force on hand or task, and the sum and
-    difference of that force. The sample is taken just before the force on the side changes.
+    They are position, its time integral and difference quotient, acceleration, the force on hand or
+    task, and the time integral and difference quotient of that force. `body` (6,) is mass, damping
+    and stiffness of the side and of hand or task, `state` (2,) position and speed. The sample is
+    taken just before the control force `force` [N] changes.
     """
     x, v = state[0], state[1]
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
@@ -254,10 +271,11 @@ PACKET_SIGNAL, PACKET_ENERGY = range(2)
 
 @compiled
 def _read_packet(sent, row, n):
-    """Return the two values of the packet that was sent in period `row`, at the latest in period n.
+    """Return the two values of the packet that was sent in the earlier of the periods `row` and n.
 
-    They are the signal (sum of waves, position or force) and the energy. Both are 0 before the first
-    arrival (`row` negative).
+    They are the signal (time integral of waves, position or force) and the energy. Both are 0
+    before the first arrival (`row` negative). `sent` holds the packets of one side, one row per
+    period.
     """
     if row < 0:
         return 0.0, 0.0

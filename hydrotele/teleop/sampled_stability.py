@@ -58,9 +58,9 @@ class PacketAges:
 
     Attributes:
         period: T of both sides [s].
-        forward: (n,) fraction of the periods in which the packet from the master is 0 .. n - 1
-            periods old [1].
-        back: (m,) the same for packets from the slave.
+        forward: (n,) fraction of the periods in which the packet from the master that the slave
+            uses is 0 .. n - 1 periods old [1].
+        back: (m,) the same for packets from the slave that the master uses.
     """
 
     period: float
@@ -106,12 +106,16 @@ def measured_delay_ages(period: float, delays_forward: np.ndarray, delays_back: 
     """Create the packet ages of a channel from measured delays of successive packets, one per period.
 
     Args:
-        period: T [s].
-        delays_forward: (n,) [s]; NaN for a lost packet.
+        period: control period T of both sides [s].
+        delays_forward: (n,) delays of the packets from the master [s]; NaN for a lost packet.
         delays_back: (m,) the same for packets from the slave [s].
 
     Returns:
-        The packet ages; delays are rounded to periods.
+        The packet ages, for delays that are rounded to periods. Periods before the first arrival do
+        not count.
+
+    Raises:
+        InputError: no packet arrives in one of the directions.
     """
     return PacketAges(
         period,
@@ -428,8 +432,9 @@ def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
 def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
     """Return two transfer functions, of the master and of the slave, from received to sent signal.
 
-    The signals are those of the channel between them: forces, or waves for wave variables. q are points
-    of the unit delay, and `reflected` is a factor on the returned force.
+    The signals are those of the channel between them: forces, or waves for wave variables. q are
+    points of the unit delay. `reflected` is a factor on the returned force; it is not applied to
+    waves.
     """
     near = _make_sampled_side(case.master, case.hand, line.period, q)
     far = _make_sampled_side(case.slave, case.task, line.period, q)
@@ -503,9 +508,11 @@ class StabilityPrediction:
 
     Attributes:
         is_stable: whether a disturbance decays; under passivity control, whether it stays bounded.
-        reason: `poles`, `jitter` (noise caused by jitter grows, though the mean does not), or for
-            passivity control `slave alone` (its own controller is unstable), `no control needed`,
-            `passive ends`, `bounded` (the slave's end is stable but not passive).
+        reason: criterion that decided. `poles`: poles of the loop, stable or not. `jitter`:
+            unstable, since noise caused by jitter grows, though the mean motion does not. Under
+            passivity control `slave alone`: unstable, since the slave with its controller and task
+            is. Stable under passivity control are `no control needed` (all poles are stable without
+            it), `passive ends`, and `bounded` (the slave's end is stable but not passive).
     """
 
     is_stable: bool
@@ -579,9 +586,9 @@ def make_tilting_body(mass: float, arm: float, inertia: float, hand: tuple[float
     Args:
         mass: mass of the flotor [kg].
         arm: height of the centre of mass above the handle's point, negative below [m].
-        inertia: inertia of the flotor about its centre of mass [kg m^2].
-        hand: mass at the handle's point [kg], damping [N s/m], stiffness [N/m], rotational damping
-            [N m s/rad] and stiffness [N m/rad] of the hand.
+        inertia: moment of inertia of the flotor about its centre of mass [kg m^2].
+        hand: the hand's mass at the handle's point [kg], damping [N s/m], stiffness [N/m],
+            rotational damping [N m s/rad] and rotational stiffness [N m/rad].
 
     Returns:
         The body; its two coordinates are displacement [m] and rotation [rad] of the handle's point.
@@ -647,6 +654,9 @@ def max_sampled_handle_eigenvalue(body: HandleBody, stiffness: np.ndarray, dampi
 def max_stable_handle_damping(inertia: float, stiffness: float, period: float) -> float:
     """Return the maximum sampled damping with which a handle that spins about its axis is stable.
 
+    Stable means that no eigenvalue over one control period has a magnitude above 1. No hand holds
+    the handle.
+
     Args:
         inertia: moment of inertia of the handle [kg m^2].
         stiffness: stiffness of the joystick's spring [N m/rad].
@@ -679,6 +689,9 @@ def max_stable_handle_damping(inertia: float, stiffness: float, period: float) -
 
 def min_stable_handle_inertia(damping: float, stiffness: float, period: float) -> float:
     """Return the minimum inertia with which a spinning handle is stable at a given sampled damping.
+
+    Stable means that no eigenvalue over one control period has a magnitude above 1. No hand holds
+    the handle.
 
     Args:
         damping: damping of the joystick's control [N m s/rad].

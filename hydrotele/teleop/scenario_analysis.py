@@ -85,13 +85,16 @@ class LoopFindings:
             reflection replaces it.
         unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
             axis.
-        gain_margin: factor on the return channels up to which the loop is stable.
+        gain_margin: factor on the return channels (from machine to joystick) up to which the loop
+            is stable.
         max_delay: maximum stable delay in each direction [s].
-        frequency: frequency of the oscillation at the margin [Hz]; NaN without a margin.
-        pole: pole of that oscillation at the present gain [rad/s]; NaN without a margin.
-        max_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
-            reflected.
-        hand_force: hand force at the machine's force limit with that ratio [N], [N m].
+        frequency: frequency of the oscillation at the stability limit, that is with the return
+            channels multiplied by `gain_margin` [Hz]; NaN without a finite margin.
+        pole: pole of that oscillation at the present gain, in the complex plane of s [rad/s]; NaN
+            without a finite margin.
+        max_ratio: maximum stable ratio of reflected hand force to machine force [N/N]; NaN if the
+            structure reflects no force.
+        hand_force: hand force at the machine's force limit with `max_ratio` [N], [N m].
         max_ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to
             stop, with the reduced gain of the dead band [N/N]; NaN without a dead band.
     """
@@ -124,7 +127,8 @@ class ScenarioFindings:
         loop: results of the scenario's structure, or of direct force reflection in its place.
         held_spring: joystick axis under stiffness feedback, with the hand.
         released_spring: joystick axis under stiffness feedback, released.
-        deadband_edge_ratio: reflection ratio of stiffness feedback at the dead band's edge [N/N].
+        deadband_edge_ratio: change of hand force per change of machine force under stiffness
+            feedback, with the handle at the edge of the dead band [N/N].
     """
 
     name: str
@@ -174,6 +178,9 @@ def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structur
         structure: control structure, one of `linear_case.STRUCTURES`.
         is_scenario_structure: whether the scenario uses this structure; it is only recorded.
 
+    Returns:
+        Poles, margins and ratios of the loop.
+
     Raises:
         InputError: the structure is not known.
     """
@@ -199,8 +206,9 @@ def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structur
 def _find_oscillation(case: LinearCase, structure: str, margin: float) -> tuple[float, complex]:
     """Return the oscillation frequency at the stability limit, and its pole at the present gain.
 
-    The pole is followed from the gain at the limit, `margin` times the present one, by Newton's
-    method. Return frequency [Hz] and pole [rad/s]; both are NaN without a finite margin.
+    At `margin` times the present gain of the return channels the loop is at its stability limit.
+    From there to the present gain the pole is followed in small steps by Newton's method. Return
+    frequency [Hz] and pole [rad/s]; both are NaN without a finite margin.
     """
     if not 0.0 < margin < math.inf:
         return math.nan, complex(math.nan, math.nan)

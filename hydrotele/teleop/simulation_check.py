@@ -15,16 +15,16 @@ SWEEP_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency 
 
 @dataclass(frozen=True)
 class SineSweep:
-    """Impedance that is transmitted to the operator, from the formula and from simulated sines.
+    """Impedance that the operator feels at the master, from a formula and from simulated sines.
 
     Attributes:
         structure: name of the structure.
         delay_forward: delay from the master to the slave [s].
         delay_back: delay from the slave to the master [s].
         frequencies: (n,) [rad/s].
-        expected: (n,) predicted by the formula [N s/m].
-        measured: (n,) measured in simulation [N s/m]; empty if the slave is unstable while the
-            master is held, so that no measurement is possible.
+        expected: (n,) complex impedance predicted by the formula [N s/m].
+        measured: (n,) complex impedance measured in simulation [N s/m]; empty if the slave is
+            unstable while the master's motion is imposed, so that no measurement is possible.
     """
 
     structure: str

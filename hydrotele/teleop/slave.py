@@ -75,8 +75,9 @@ class SlaveParameters(NamedTuple):
             band, range, coupling stiffness, coupling damping, hand per machine force, lever of the
             virtual mass [1] or [m^2], maximum speed [m/s] or [rad/s], limit of the reflected force
             [N] or [N m], wave impedance [N s/m].
-        limits: (5,) packet timeout [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
-            mass [kg], phase lead of the drives [s].
+        limits: (5,) packet timeout [s], maximum following error of a joint [rad], maximum
+            acceleration of a task coordinate [m/s^2] or [rad/s^2], virtual mass [kg], phase lead of
+            the drives [s].
         kind: (5,) the four elements of `MasterParameters.kind`, then 1 if the inverse Jacobian
             resolves the motion.
     """
@@ -98,15 +99,17 @@ class SlaveState(NamedTuple):
         joint: (k,) joint references [rad].
         joint_rate: (k,) rates of the joint references [rad/s].
         ahead: (k,) joint rates with phase lead, for the delay of the valves [rad/s].
-        measured: (2, 5) measured pose of the tip and its filtered rate.
-        command: (3, 6) last packet: displacement of the handle, its rate, hand force.
+        measured: (2, 5) measured pose of the tip [m], [rad] and its filtered rate [m/s], [rad/s].
+        command: (3, 6) last packet from the master: displacement of the handle, its rate, hand
+            force. With a passive channel the last two are the channel's signal and energy.
         force_integral: (5,) integral of the rate gain times the hand force, for four channels under
             rate control.
         asked: (5,) integral of the commanded rate, for four channels under rate control [m], [rad].
-        flags: (4,) whether the reference is held at the workspace edge, no packets arrive, the
-            valves are closed permanently; age of the last packet [s].
-        line: (5, 10) end of a passive channel for each coordinate, elements as in `MasterState.line`,
-            in the scale of the handle.
+        flags: (4,) three flags, 0 or 1: the reference is held at the workspace edge, no packets
+            arrive, the valves are closed permanently; then the time since the last packet arrived
+            [s].
+        line: (5, 10) slave's end of a passive channel for each coordinate, elements as in
+            `MasterState.line`, in the scale of the handle.
     """
 
     pose: np.ndarray
@@ -235,7 +238,8 @@ def measure_tip(parameters, joint, fresh, elapsed, s):
         joint: (k,) measured joint angles [rad].
         fresh: whether there is a new sample, scalar.
         elapsed: time since the last sample, scalar [s].
-        s: SlaveState; pose and rate are written to `measured`, unless there is no new sample.
+        s: SlaveState; pose and rate are written to `measured`, unless there is no new sample or the
+            pose is not finite.
 
     Returns:
         Nothing.
@@ -260,8 +264,9 @@ def measure_tip(parameters, joint, fresh, elapsed, s):
 def update_joint_references(parameters, packet, arrived, force, joint, period, s):
     """Compute the joint references of this control period from the master's packet.
 
-    The handle commands rates of the task coordinates, which are limited in speed and acceleration and
-    resolved to the joints. Without packets the rates go to zero.
+    The handle commands rates of the task coordinates, which are limited in speed and acceleration
+    and resolved to the joints. If no packet has arrived for longer than the packet timeout, the
+    rates go to zero.
 
     Args:
         parameters: SlaveParameters.
@@ -337,8 +342,11 @@ def update_joint_references(parameters, packet, arrived, force, joint, period, s
 def _commanded_rate(numbers, row, c, x, v, hand, force, period, s):
     """Return the rate [m/s] or [rad/s] of task coordinate c that the master commands.
 
-    `x` and `v` are displacement and rate of the handle and `hand` its force, with the sign of the
-    coordinate; `force` is the contact force. The mode and the structure of the control select the law.
+    `x` and `v` are displacement and rate of the handle and `hand` the force of the hand, with the
+    sign of the coordinate; with a passive channel `v` is the channel's signal and `hand` its
+    energy. `force` is the contact force. The control structure and the mode (rate or position)
+    select the law. Under rate control the rate is proportional to the displacement beyond the dead
+    band.
     """
     if numbers.kind[0] == FOUR_CHANNEL:
         return _four_channel_rate(numbers, row, c, x, v, hand, force, period, s)
@@ -402,7 +410,8 @@ def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
 
     The force `pull` of the channel's slave end and the scaled contact force F move the mass:
     `M z'' = pull + ratio F`, with z the motion in the scale of the handle. The received packet gives
-    `total`, the sum of the master's waves or the handle position, and `budget`, the energy sent.
+    `total`, the time integral of the master's waves or the handle position, and `budget`, the
+    energy that the master has put into the channel, with the sign of the coordinate.
     """
     gain, spring, damper, end = row[AXIS_GAIN], row[SPRING], row[DAMPER], s.line[c]
     speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
@@ -424,12 +433,14 @@ def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
 
 @compiled
 def check_following_error(parameters, joint, s):
-    """Close the valves permanently if a joint is too far from its reference.
+    """Set the flag that closes the valves permanently if a joint is too far from its reference.
+
+    The limit is the maximum following error of `parameters`.
 
     Args:
         parameters: SlaveParameters.
         joint: (k,) measured joint angles [rad]; a value that is not finite also closes the valves.
-        s: SlaveState; the flag that closes the valves is set in `flags`.
+        s: SlaveState; the flag VALVES_CLOSED in `flags` is set, never reset.
 
     Returns:
         Nothing.

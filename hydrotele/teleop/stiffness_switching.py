@@ -61,8 +61,8 @@ class StiffnessAxis:
     def stability_theorem_margin(self) -> float:
         """Margin `B^2 - 4 M K_max` of the stability theorem of stiffness feedback [(N s/m)^2].
 
-        The axis is stable with every change of the stiffness if the margin and K_min are positive; the
-        condition is sufficient, not necessary (Zhu 1994, 4.14).
+        The axis is stable with every change of the stiffness between K_min and K_max if the margin,
+        B and K_min are positive. The condition is sufficient, not necessary (Zhu 1994, 4.14).
         """
         return stability_theorem_margin(self.mass, self.damping, self.max_stiffness)
 
@@ -82,7 +82,8 @@ class StiffnessAxis:
     def min_stable_damping(self) -> float:
         """Damping at which motion under the worst stiffness switching keeps its size [N s/m].
 
-        More damping makes it decay. The value is infinite if the minimum stiffness is 0.
+        With more damping the motion decays. The value is infinite if the minimum stiffness is 0,
+        and 0 if minimum and maximum stiffness are equal.
         """
         if self.min_stiffness <= 0.0:
             return math.inf
@@ -140,7 +141,8 @@ def worst_switching_growth(mass: float, damping: float, min_stiffness: float, ma
 def compute_switching_growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
     """Compute the growth of an oscillation's speed on a grid of damping and maximum stiffness.
 
-    The stiffness switches between its bounds in the worst way: low outwards, high inwards.
+    The stiffness switches between its bounds in the worst way: the lower bound while the mass moves
+    away from the centre, the upper bound while it returns.
 
     Args:
         mass: mass of the axis [kg].

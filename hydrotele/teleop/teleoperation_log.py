@@ -65,11 +65,11 @@ class TeleoperationLog:
         """Return the recorded signals as channels of the run's log, at the rate of the log.
 
         Args:
-            every: control ticks per row of the log.
+            every: control ticks per row of the log; the signals are sampled, not averaged.
             rows: number of rows of the log.
 
         Returns:
-            (channel -> (rows,), channel -> unit).
+            Two dictionaries: channel name -> (rows,) values, and channel name -> unit.
         """
         values: dict[str, np.ndarray] = {}
         units: dict[str, str] = {}

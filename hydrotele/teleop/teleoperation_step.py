@@ -45,8 +45,8 @@ class SlaveSide(NamedTuple):
     """Arrays of the machine side of teleoperation; k joints of the arm among nu axes.
 
     Attributes:
-        joint: (nu,) measured positions [rad] or [m].
-        force: (k,) tip force in task coordinates [N], [N m].
+        joint: (nu,) measured joint positions of all axes [rad] or [m].
+        force: (k,) force of the environment on the tip, in task coordinates [N], [N m].
         columns: (k,) indices of the arm's joints among the axes.
         slave: (24 + 14 k,) SlaveParameters as a flat array.
         state: (102 + 3 k,) SlaveState as a flat array, written.
@@ -64,8 +64,9 @@ class ChannelBuffers(NamedTuple):
 
     Attributes:
         forward: (n, 3, 6) ring buffer of the master's packets, written: displacement and rate of
-            the handle, hand force minus the joystick's own spring and damper force. A passive
-            channel replaces the last two by the sum of waves or the position, and the energy.
+            the handle, and hand force minus the force of the joystick's spring and damper. A
+            passive channel replaces the last two by the time integral of its waves or the handle
+            position, and the energy.
         back: (n, 8, k) ring buffer of the machine's packets, written.
         packet: (8, k) last packet received by the master, written.
         age: (ticks, 2) age of the arriving packet, forward and back, in ticks; negative if no
@@ -173,11 +174,11 @@ def step_slave_side(tick, machine, line, grid, table, scale, reference, rate, dr
         tick: number of the control tick, scalar.
         machine: SlaveSide.
         line: ChannelBuffers.
-        grid: (nu, 2) lowest joint position and step of the table, from `tabulate_drives`.
-        table: (nu, points, 3) moment arms and chamber volumes, from `tabulate_drives`.
+        grid: (nu, 2) lowest joint position and step of the table, from `tabulate_drive_geometry`.
+        table: (nu, points, 3) moment arms and chamber volumes, from `tabulate_drive_geometry`.
         scale: factor on the reference velocities of the drives, the servo's feedforward, scalar.
-        reference: (nu,) joint references, those of the arm written [rad] or [m].
-        rate: (nu,) rates of the joint references [rad/s] or [m/s].
+        reference: (nu,) joint references [rad] or [m]; those of the arm are written.
+        rate: (nu,) rates of the joint references [rad/s] or [m/s]; those of the arm are written.
         drive: DriveReference, written.
 
     Returns:
@@ -225,7 +226,10 @@ STATION_DTYPE = np.dtype(
 
 @compiled
 def _unpack_record(r):
-    """Return SlaveSide, ChannelBuffers and MasterSide: views of the arrays to whose addresses a record refers."""
+    """Return SlaveSide, ChannelBuffers and MasterSide as views of the arrays of a record.
+
+    The record `r` (STATION_DTYPE) holds sizes and memory addresses of the arrays.
+    """
     k, rows, back = r.joints, r.forward_rows, r.back_rows
     machine = SlaveSide(
         float64_view(r.joint, r.axes), float64_view(r.force, k), int64_view(r.columns, k),

@@ -63,7 +63,8 @@ class TeleoperationSystem:
     Attributes:
         coordinates: task coordinates of the arm.
         log: recorded signals by control tick.
-        notes: messages for the user: trips, missing packets, workspace edge.
+        notes: messages for the user: valves closed after a fault, missing packets, motion held at
+            the workspace edge.
         valves_closed: whether the valves were closed permanently.
     """
 
@@ -80,7 +81,8 @@ class TeleoperationSystem:
             plan: references of the run, written tick by tick.
             drives: references of the drives, written tick by tick.
             feedback: sensor readings of the machine, refreshed before every tick.
-            hand_input: input of a live operator.
+            hand_input: function that returns the handle reference of a live operator; None for a
+                simulated one.
 
         Raises:
             InputError: joystick, gains and arm are not compatible, or a live operator has no input.
@@ -195,7 +197,7 @@ class TeleoperationSystem:
 
     @property
     def deadbands_and_stops(self) -> np.ndarray:
-        """Dead-band edge and stop of every joystick axis (2, 6) [m], [rad]."""
+        """Dead-band edges (row 0) and stops (row 1) of the six joystick axes, (2, 6) [m], [rad]."""
         return self._master.axis[:, [DEADBAND, HANDLE_RANGE]].T
 
     def prepare_tick(self, tick: int) -> None:
@@ -227,7 +229,12 @@ class TeleoperationSystem:
             operator.decide_handle_reference(tick)
 
     def next_prepared_tick(self, tick: int) -> int:
-        """Return the next control tick after `tick` that needs `prepare_tick`."""
+        """Return the next control tick after `tick` that needs `prepare_tick`.
+
+        These are the ticks with a decision of the operator or a sensor sample. Every tick needs it
+        with a real device, sensor faults, exact contact force, tip-over protection, or coils whose
+        force falls towards the end of their gap.
+        """
         if self._exchange or self._every_tick:
             return tick + 1
         every = math.gcd(self.operator.ticks_per_decision, self._feedback.ticks_per_sample)
@@ -235,6 +242,9 @@ class TeleoperationSystem:
 
     def run_safety_checks(self, tick: int) -> bool:
         """Run the safety checks before the machine moves; return whether to close the valves.
+
+        The valves close permanently if a joint does not follow its reference or a sensor's reading
+        is constant. Messages for the user are added to `notes`.
 
         Args:
             tick: control tick for which `step_teleoperation` returned true, or a multiple of
@@ -266,7 +276,13 @@ class TeleoperationSystem:
             self._line.back[:, TASK_MASS] = self._task_estimator.mass
 
     def summary(self) -> dict[str, float | int | bool | None]:
-        """Return statistics of the run: handle energy, coil currents, largest values, closed valves."""
+        """Return name -> statistic of the run.
+
+        Statistics are the energy from the hand into the handle and its minimum [J], the largest
+        displacement [m] and rotation [rad] of the handle, the largest coil current [A] and relative
+        coil heat [1]. Others are the number of periods with limited currents, the largest radial or
+        vertical tip force [N], and whether the valves were closed permanently (`tripped`).
+        """
         handle, energy = np.abs(self.log.master("handle")), self._m.energy
         return {
             "handle_energy_J": float(energy[0]),
@@ -281,9 +297,10 @@ class TeleoperationSystem:
         }
 
     def _close_valves_on_fault(self, tick: int) -> None:
-        """Request closed valves if a joint lags its reference or a sensor is constant.
+        """Set `valves_closed` if a joint does not follow its reference or a sensor is constant.
 
-        The reason, missing packets and the workspace edge are added to `notes`, each once.
+        The reason is added to `notes`, and also a message about missing packets and one about
+        motion held at the workspace edge, each once.
         """
         now, s = tick * self._period, self._s
         if s.flags[HELD_AT_EDGE] and "edge" not in self._noted_keys:
@@ -307,10 +324,10 @@ class TeleoperationSystem:
         self.notes.append(sentence)
 
     def _update_true_force(self) -> None:
-        """Write the simulator's exact contact force on the tip, in task coordinates.
+        """Set the tip force to the simulator's exact contact force, in task coordinates.
 
-        Radial force [N], moment about the swing axis [N m] and vertical force [N]; moments of the tool
-        stay 0.
+        The elements are radial force [N], moment about the swing axis [N m] and vertical force [N];
+        moments of the tool stay 0.
         """
         self._force[:] = 0.0
         if not self._data.ncon:
@@ -337,7 +354,10 @@ class _FrozenSensor:
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
-        """Replace the reading in `seen` by the frozen one, if the fault has started at `time` [s]."""
+        """Replace the reading in `seen` by its value at the start of the fault, from that time on.
+
+        `time` is the present time [s]. For a joint sensor the measured joint rate is set to 0.
+        """
         readings = getattr(seen, self._name)
         if time < self._start_time:
             return
@@ -358,7 +378,8 @@ def _make_force_estimator(
 ) -> EndpointForce | None:
     """Create the estimator of the tip force from the drive pressures.
 
-    Return None if the exact force is used and no sensor has to be checked.
+    Return None if the exact force is used and the machine has no sensors. If the exact force is
+    used with sensors, the estimator serves only to find constant readings.
     """
     if pilot.force == "true" and sensors is None:
         return None
@@ -391,9 +412,10 @@ def _joystick_path(scenario: Scenario, name: str) -> str:
 
 
 def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> ChannelBuffers:
-    """Create the channel's buffers, with the ages of arriving packets from delays, jitter and losses.
+    """Create the channel's buffers and ages of arriving packets, from delays, jitter and losses.
 
-    Raise InputError for a delay that is not shorter than the run.
+    `k` is the number of task coordinates. Raise InputError for a delay that is not shorter than the
+    run.
     """
     channel, period = pilot.channel, 1.0 / scenario.control_rate
     for name in ("delay_forward", "delay_back"):
@@ -417,7 +439,8 @@ def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> Cha
 def _packet_delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
     """Return the delays (ticks, 2) of all packets of a run, forward and back, in control ticks.
 
-    They are constant, random with jitter, or from a trace file. Lost packets of a trace are -1.
+    They are constant, or a constant plus an exponentially distributed jitter, or from a trace file,
+    which is repeated as often as necessary. Lost packets of a trace are -1.
     """
     ticks = scenario.tick_count
     if channel.trace:

@@ -62,9 +62,10 @@ class SimulatedRun(NamedTuple):
     """Results of one time simulation of a teleoperator axis.
 
     Attributes:
-        max_speeds: (20,) maximum of the sum of master's and slave's speed in each twentieth of the run
-            [m/s].
-        impedance: force over velocity of an imposed motion at its frequency [N s/m], otherwise 0.
+        max_speeds: (20,) maximum of the sum of master's and slave's speed magnitudes in each
+            twentieth of the run [m/s]; 0 after an early stop.
+        impedance: complex ratio of hand force to the master's velocity at the frequency of an
+            imposed motion [N s/m]; 0 without an imposed motion.
     """
 
     max_speeds: np.ndarray
@@ -165,7 +166,8 @@ def simulate_impulse_response(
 def is_growing(run: SimulatedRun) -> bool:
     """Return whether the motion of a simulated run grows: late speeds exceed early ones.
 
-    After an early stop the last speed is compared with the initial one.
+    The largest speed in the last fifth of the run is compared with that in the second fifth. After
+    an early stop the last speed is compared with the initial one.
     """
     reached = run.max_speeds[run.max_speeds > 0.0]
     if len(reached) < _BLOCKS:
@@ -225,7 +227,8 @@ def _build_equations(
 
     Rows: equations of motion of master, hand and slave, and the derivative of the slave's equation.
     If no force depends on the slave's jerk, the last row sets the jerk to 0. With `imposed` motion
-    the second row sets the master's acceleration instead.
+    the second row sets the master's acceleration instead. `lags` are the delays of the forward and
+    the return channel in whole steps; the signals of a channel with 0 count as present ones.
 
     Returns:
         Coefficients (4, 10) on the present signals, and (4, 20) on the delayed ones: ten delayed by
@@ -275,8 +278,13 @@ def _move_undelayed_coefficients(
 def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
     """Integrate a run step by step, after an initial velocity or with an imposed sine.
 
-    Return the largest speeds (20,) of the parts of the run [m/s], and the complex Fourier sums (2,) of
-    hand force and velocity at the imposed frequency.
+    `inverse`, `known` and `delayed` are the matrices that solve for accelerations and hand force.
+    `lags` (2,) are the whole and `beyond` (2,) the fractional delays of both channels in steps.
+    `rows` is the number of steps, of which the last `measured` count for the sums. `frequency`
+    [rad/s] is that of the imposed sine; 0 selects the initial velocity.
+
+    Return the largest speeds (20,) of the parts of the run [m/s], and the complex Fourier sums (2,)
+    of hand force and master velocity at the imposed frequency.
     """
     past = np.zeros((max(lags[0], lags[1]) + 2, 10))
     largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
@@ -309,7 +317,12 @@ def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured,
 
 @compiled
 def _interpolate_delayed(past, n, lags, beyond, late):
-    """Write the delayed signals of both channels to `late` (20,), interpolated between two steps."""
+    """Write the delayed signals of both channels to `late` (20,), interpolated between two steps.
+
+    `past` is the ring buffer of the ten signals by step, and n the present step. `lags` (2,) are
+    the whole and `beyond` (2,) the fractional delays in steps. A channel without delay is not
+    written.
+    """
     for side in range(2):
         if lags[side] > 0 and n > lags[side]:
             row, share = n - lags[side], beyond[side]
@@ -320,7 +333,12 @@ def _interpolate_delayed(past, n, lags, beyond, late):
 
 @compiled
 def _solve_accelerations_and_force(q, late, inverse, known, delayed, frequency):
-    """Solve for both accelerations, the hand's force and the slave's jerk; write them to q (10,)."""
+    """Solve for both accelerations, the hand's force and the slave's jerk; write them to q (10,).
+
+    q holds the present signals and `late` (20,) the delayed ones. `inverse`, `known` and `delayed`
+    are the matrices of the solved linear equations. A `frequency` [rad/s] other than 0 imposes a
+    sine.
+    """
     for i in range(4):
         total = 0.0
         for j in range(20):

@@ -53,8 +53,9 @@ def compute_tip_over_protection(
 ) -> None:  # fmt: skip
     """Compute a force on the handle's vertical axis that keeps the machine from tipping.
 
-    The force is that of an additional spring and damper to the centre. It acts only while the handle is
-    deflected in the direction that increases the tipping moment. It brings the handle back into the
+    The force is that of an additional spring and damper to the centre. It builds up while the
+    tipping ratio rises from `moment_fraction` to 0.1 above. It acts only while the handle is
+    deflected in the direction that increases the tipping moment. It moves the handle towards its
     dead band and never commands a motion.
 
     Args:
@@ -63,7 +64,7 @@ def compute_tip_over_protection(
         packet: (8, k) data from the machine, rows as in `compute_reflected_forces`.
         start: (5,) pose of the tip at the start: r [m], theta [rad], z [m], attitude, head [rad].
         handle: (6,) measured displacement of the handle [m], [rad].
-        speed: (6,) its rate [m/s], [rad/s].
+        speed: (6,) rate of the handle's displacement [m/s], [rad/s].
         extra: (6,) additional force on the handle, written [N], [N m]; 0 without danger.
 
     Source: Zhu 1994, chapter 6 (tip-over of an excavator that presses too hard).

@@ -70,7 +70,10 @@ class TwoPort:
     delay_back: float = 0.0
 
     def channels(self, s: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Evaluate the channels C1, C2, C3, C4 at complex frequencies s, with their delays."""
+        """Return the channels C1, C2, C3, C4 at complex frequencies s [rad/s], with their delays.
+
+        C1 and C3 have the forward delay, C2 and C4 the return delay.
+        """
         late, back = np.exp(-s * self.delay_forward), np.exp(-s * self.delay_back)
         return (
             self.velocity_forward(s) * late, self.force_back(s) * back,
@@ -104,8 +107,8 @@ def make_two_port(
         structure: `position_position` (coordinating force), `position_force` (direct force),
             `four_channel_position` (transparent), and the same under rate control:
             `rate_position`, `rate_force`, `four_channel_rate`.
-        master: mass and friction of the master.
-        slave: mass and friction of the slave.
+        master: impedance (mass, damping and stiffness) of the master.
+        slave: impedance of the slave.
         master_control: damper and spring of the master's controller.
         slave_control: damper and spring of the slave's controller.
         gains: gains of the channels; those that the structure does not have are ignored.
@@ -266,7 +269,7 @@ def stability_theorem_margin(mass: float, damping: float, stiffest: float) -> fl
     Args:
         mass: mass of joystick and hand, M [kg] or [kg m^2].
         damping: damping of both, B [N s/m] or [N m s/rad].
-        stiffest: upper bound of the stiffness, K_max [N/m] or [N m/rad].
+        stiffest: upper bound of the stiffness of both, K_max [N/m] or [N m/rad].
 
     Returns:
         The margin [(N s/m)^2] or [(N m s/rad)^2].

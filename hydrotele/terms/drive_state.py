@@ -23,11 +23,12 @@ class DriveState(NamedTuple):
         pressure_head: pressure of the head-side chamber, or port A of a motor [Pa].
         pressure_rod: pressure of the rod-side chamber, or port B [Pa].
         pressure_supply: pressure at the inlet of the valves [Pa].
-        command: command to the valve or drive after its delay, without terms [1], [V].
+        command: command to the valve or drive after its delay, without terms [1], [V] or [N].
         force: force of the oil on the piston, or of a force drive, before friction [N] or [N m].
-        play_output: output of the term's backlash operator (`play`) [unit of its variable]; 0 without.
-        play_difference: difference between the variable and this output, at most half the backlash
-            width.
+        play_output: output of the term's backlash operator (`play`) [unit of its variable]; 0
+            without.
+        play_difference: the variable of the backlash operator minus its output, at most half the
+            backlash width in magnitude [unit of the variable]; 0 without.
     """
 
     time: float
@@ -45,11 +46,12 @@ class DriveState(NamedTuple):
 
 
 class Drives(NamedTuple):
-    """States of all drives at an instant, for laws that use variables of another drive.
+    """States of all nu drives, for the hydraulic step and for laws that use variables of another drive.
 
     Attributes:
         count: number of hydraulic drives, which come first.
-        act: (>= 4 count,) spool [1], spool rate [1/s], head- and rod-side pressure [Pa] of each.
+        act: (>= 4 count,) spool [1], spool rate [1/s], head- and rod-side pressure [Pa] of each
+            hydraulic drive; then the additional states.
         position: (nu,) piston displacements or motor angles [m] or [rad].
         velocity: (nu,) their rates [m/s] or [rad/s].
         command: (nu,) commands after their delays [1] or [V].
@@ -71,5 +73,5 @@ _RENAMED_VARIABLES = {"played": "play_output", "ahead": "play_difference"}
 
 
 def suggest_valid_variable(name: str) -> str:
-    """Return a sentence with the closest valid name of a state variable."""
+    """Return a hint for an error message: the closest name of a state variable, and all valid names."""
     return suggest_valid_name(name, VARIABLES, _RENAMED_VARIABLES)

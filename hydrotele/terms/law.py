@@ -64,8 +64,8 @@ class Law:
         kinds: argument name -> float, Variable or Numbers, in the order of the arguments.
         defaults: values of optional arguments.
         check: called with the complete parameters; raises ValueError for invalid parameters.
-        translate: converts the parameters of a machine file to the arguments; None if they are the
-            same.
+        translate: converts the parameters of a machine file to the arguments of the function; None
+            if both are the same.
         source: file or entry point that defines the law; empty for the laws of this package.
     """
 
@@ -177,9 +177,9 @@ def law(
 
 
 class LawSource:  # noqa: N801 - a context manager, named as it is read
-    """Context manager: laws that are registered inside it belong to a given file or plug-in.
+    """Context manager that marks the laws registered inside it as those of a given file or plug-in.
 
-    Error messages and `Law.source` name that file or plug-in.
+    `Law.source` and error messages then name that file or plug-in.
     """
 
     def __init__(self, source: str) -> None:
@@ -274,7 +274,11 @@ def _split_factors(node: ast.expr) -> list[ast.expr]:
 
 
 def _parse_factor(text: str, node: ast.expr) -> list[float]:
-    """Encode a factor as function code, two variable indices, two constants and power."""
+    """Encode a factor of a product as function code, two variable indices, two constants and power.
+
+    `node` is the syntax tree of the factor; messages quote `text`, the product. Raise ValueError
+    for invalid syntax.
+    """
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         exponent = _constant_value(node.right)
@@ -297,14 +301,17 @@ def _parse_factor(text: str, node: ast.expr) -> list[float]:
 
 
 def _parse_argument(text: str, node: ast.expr) -> list[int]:
-    """Return the indices of the variables of `a` or `a - b`; the second is -1 without `b`."""
+    """Return the two indices in `DriveState` of the variables of `a - b`; the second is -1 for `a` alone."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return [_parse_variable(text, node.left), _parse_variable(text, node.right)]
     return [_parse_variable(text, node), _NO_VARIABLE]
 
 
 def _parse_variable(text: str, node: ast.expr) -> int:
-    """Return the index in `DriveState` of the variable that a syntax node names."""
+    """Return the index in `DriveState` of the variable that a syntax node names.
+
+    Raise ValueError if it names no variable.
+    """
     name = node.id if isinstance(node, ast.Name) else ast.get_source_segment(text, node) or text
     if name not in VARIABLES:
         raise _make_formula_error(text, f"{name!r} is not a variable; {suggest_valid_variable(name)}")
@@ -349,7 +356,7 @@ def constant(s: DriveState, value: float) -> float:
 
 @law
 def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
-    """Return a pulse of force, flow or command: `size` from `start` [s] for a `duration` [s], else 0.
+    """Return a force, flow or command pulse: `size` from `start` [s] for a `duration` [s], otherwise 0.
 
     The edges are half cosine waves, centred on start and end; their length is the fraction `edge`
     of the duration. The pulse is thus differentiable with respect to every parameter.
@@ -452,7 +459,7 @@ def bilinear_table(
 ) -> float:  # fmt: skip
     """Interpolate an additional force, flow or command bilinearly in two state variables of a drive.
 
-    The value is constant beyond the outer points.
+    A variable beyond its outer points is replaced by the nearest of them.
 
     `values` has one row for each of the `row_points`, and one column for each of the
     `column_points`; the compiled law receives it row by row.

@@ -67,7 +67,9 @@ binding.add_symbol("hydrotele_laws", _law_addresses.ctypes.data)
 
 
 def law_index(name: str) -> int:
-    """Return the index of a law in this process's table of law addresses; compile it on first use.
+    """Return the index of a law in this process's table of law addresses.
+
+    The law is compiled and added to the table on its first use.
 
     Raises:
         InputError: the law is not known in this process, or numba cannot compile it.
@@ -96,8 +98,8 @@ def name_checksum(name: str) -> int:
 def _compile_c_function(law: Law):
     """Compile a law to a C function `double(double *parameters, double *state)`.
 
-    The parameters are those of `Law.encode_parameters`. Raise InputError if numba cannot compile a
-    user's law.
+    The parameters are the array of `Law.encode_parameters`, and the state the values of a
+    `DriveState`. Raise InputError if numba cannot compile a user's law.
     """
     places, arguments = 1, []
     for kind in law.kinds.values():
@@ -179,14 +181,15 @@ def encode_terms_table(
 
 
 def terms_with_hysteresis(terms: Sequence[Term]) -> list[Term]:
-    """Return the terms with hysteresis (backlash operator or relay), in their order."""
+    """Return those of the terms that have hysteresis (backlash operator or relay), in the same order."""
     return [term for term in terms if term.play or term.switch]
 
 
 def _hysteresis_parameters(term: Term, place: int) -> tuple[float, ...]:
     """Return kind, activation index, variable index, shift and scale of a term's hysteresis.
 
-    The hysteresis operates on `(variable - shift) / scale`. The kind is 0 without hysteresis.
+    The kind is PLAY, SWITCH, or 0 without hysteresis. The activation index, `place`, is that of the
+    internal state. The hysteresis operates on `(variable - shift) / scale`.
     """
     if term.play:
         return PLAY, place, VARIABLES[term.play.variable], 0.0, term.play.half_width
@@ -245,8 +248,9 @@ def _call_law(typingctx, function, terms, at, state):
 def _get_law_input(terms, at, k, value, s, drives):
     """Return the value of state variable k that the law of a term receives.
 
-    It is that of another drive if the term's `variables_from` names one, otherwise `value`. It is
-    clipped to the term's `domain`. `at` is the start of the term's row in the table.
+    If the term's `variables_from` contains the variable, it is the value of the drive named there,
+    otherwise `value`. It is clipped to the range in the term's `domain`, if any. `at` is the start
+    of the term's row in the table, and s the DriveState of the term's own drive.
     """
     first = int(terms[at + _DOMAIN])
     last = first + 3 * int(terms[at + _RANGES])
@@ -261,14 +265,22 @@ def _get_law_input(terms, at, k, value, s, drives):
 
 @compile_without_allocation
 def _hysteresis_state(terms, at, drives):
-    """Return the internal state of a term's hysteresis, scalar [1]; 0 if the simulator stores none."""
+    """Return the internal state of a term's hysteresis from the activations, scalar [1].
+
+    It is 0 if the activations do not contain the state. `at` is the start of the term's row in the
+    table.
+    """
     place = int(terms[at + _STATE_INDEX])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
 
 @compile_without_allocation
 def _hysteresis_variable(terms, at, s, drives):
-    """Return the present value of the state variable that drives a term's hysteresis [its unit]."""
+    """Return the present value of the state variable on which a term's hysteresis depends [its unit].
+
+    It is the value of another drive if `variables_from` contains the variable. `at` is the start of
+    the term's row in the table.
+    """
     k = int(terms[at + _HYSTERESIS_VARIABLE])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
     for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
@@ -324,7 +336,7 @@ def update_term_state(terms, term, value, state):
 
 @compile_without_allocation
 def locate_hysteresis_state(terms, term):
-    """Return where a term's hysteresis state is stored, and which drive's variable drives it.
+    """Return the index of a term's hysteresis state, and the variable and drive on which it depends.
 
     Returns:
         (index in MuJoCo's activation vector, 0 for none; actuator index of the drive; index of the
@@ -341,10 +353,11 @@ def locate_hysteresis_state(terms, term):
 
 @compile_without_allocation
 def _other_drive_variable(terms, j, s, drives):
-    """Return the variable of another drive that entry j of the table selects.
+    """Return the value of a variable of another drive.
 
-    Time, supply pressure and other shared variables are those of s. The value is 0 if the simulator
-    does not provide the variable.
+    From index j, the table contains the index of the variable, the index of the drive and its two
+    piston areas. Time, supply pressure and other shared variables are those of s. The value is 0 if
+    the simulator does not provide the variable.
     """
     k, i = int(terms[j]), int(terms[j + 1])
     if i < 0 or i >= len(drives.velocity):
@@ -378,7 +391,7 @@ _window_factor = compile_without_allocation(window_factor)
 
 @compile_without_allocation
 def has_term(terms, balance, axis):
-    """Return whether any term adds to the force, to a flow or to the command of a drive.
+    """Return whether any term adds to a given balance (force, a flow or command) of a drive.
 
     Args:
         terms: (n,) table of `encode_terms_table`.
@@ -399,7 +412,9 @@ def has_term(terms, balance, axis):
 
 @compile_without_allocation
 def sum_terms(terms, balance, axis, s, drives):
-    """Return the sum of all terms that add to the force, to a flow or to the command of a drive.
+    """Return the sum of all terms that add to a given balance (force, a flow or command) of a drive.
+
+    Time windows and relays multiply the values of the laws.
 
     Args:
         terms: (n,) table of `encode_terms_table`.
@@ -457,9 +472,9 @@ def sum_terms(terms, balance, axis, s, drives):
 
 @compile_without_allocation
 def _shift_state(s, velocity, head, rod):
-    """Return a copy of a DriveState with increments added to velocity and chamber pressures.
+    """Return a copy of a DriveState with increments added to velocity, head-side and rod-side pressure.
 
-    The derivatives by finite differences use it.
+    It is used for derivatives by finite differences.
     """
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
@@ -492,13 +507,13 @@ def sum_terms_with_slope(terms, balance, axis, s, drives):
 def sum_flow_terms(terms, axis, s, drives):
     """Return the flows that a machine's terms add to both chambers of a drive, and their derivatives.
 
-    The derivatives are those of each flow by the pressure of its chamber.
+    Each flow is differentiated by the pressure of the chamber that it enters.
 
     Args:
         terms: (n,) table of `encode_terms_table`.
         axis: index of the actuator.
-        s: DriveState.
-        drives: Drives.
+        s: DriveState of the drive.
+        drives: Drives, for variables of other drives and hysteresis states.
 
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]). The slopes are

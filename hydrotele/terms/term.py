@@ -32,10 +32,10 @@ DRIVE_VARIABLES = (
 class Play(StrictModel):
     """Backlash operator (play) between a state variable and the law of a term.
 
-    The output stays constant while the variable moves within `half_width` [unit of the variable] of
-    it, and follows the variable beyond. The law reads the output as `play_output`, and the variable
-    minus the output as `play_difference`. The initial output is the value nearest to 0 that the
-    variable permits.
+    The output stays constant while the variable differs from it by at most `half_width`
+    [unit of the variable]. Beyond, the output follows the variable at this distance. The law reads
+    the output as `play_output`, and the variable minus the output as `play_difference`. The initial
+    output is the value nearest to 0 that the variable permits.
     """
 
     variable: str
@@ -46,8 +46,9 @@ class Switch(StrictModel):
     """Relay with hysteresis that switches a law on and off by a state variable.
 
     The law becomes active when the variable passes `on`, and inactive when it returns past `off`
-    (both in the unit of the variable). Each transition is a ramp over a tenth of the interval between
-    both. With `on` below `off` the law is active at low values of the variable.
+    (both in the unit of the variable). Each transition is a ramp, centred on its threshold, over a
+    tenth of the interval between both thresholds. With `on` below `off` the law is active at low
+    values of the variable.
     """
 
     variable: str
@@ -73,8 +74,8 @@ class Term(StrictModel):
     - `variables_from`: variables taken from another drive; with `{velocity: swing}` the variable
       `velocity` of the law is that of the swing.
     - `domain`: variable -> range to which it is clipped.
-    - `window`: start and stop time between which the term is active [s], each with a ramp of 0.1 s.
-    - `play`, `switch`: hysteresis of the term, in a machine with hydraulic axes.
+    - `window`: start and stop time between which the term is active [s], with a ramp of 0.1 s at each.
+    - `play`, `switch`: hysteresis of the term, only one of them, in a machine with hydraulic axes.
     - `uncertainty`: standard deviation of the value of the law.
     - `source`: file or plug-in that defines the law; empty for laws of hydrotele.
     """

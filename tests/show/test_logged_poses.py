@@ -5,14 +5,15 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion, point_trajectory
+from hydrotele.show.logged_poses import body_poses, extract_joint_motion, point_trajectory
 from hydrotele.simulate.closed_loops import close_along_motion, close_loops, compute_loop_closure_error
+from hydrotele.simulate.mechanism import compile_mechanism
 
 
 @pytest.fixture(scope="module")
 def model(machine):
     """The model with its looks."""
-    return compile_visual_model(machine)
+    return compile_mechanism(machine)
 
 
 @pytest.mark.nightly
@@ -53,7 +54,7 @@ def test_without_joints_the_machine_is_at_home(machine, model):
 
 def test_an_impossible_pose_names_its_row(stuck):
     with pytest.raises(InputError, match="row 1: .*do not close.*bucket"):
-        body_poses(stuck, compile_visual_model(stuck), {"bucket": np.array([-1.2, 1.0])})
+        body_poses(stuck, compile_mechanism(stuck), {"bucket": np.array([-1.2, 1.0])})
 
 
 def test_a_jump_does_not_change_the_branch(machine, model):

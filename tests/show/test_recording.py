@@ -10,9 +10,10 @@ import pytest
 import rerun as rr
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion
+from hydrotele.show.logged_poses import body_poses, extract_joint_motion
 from hydrotele.show.recording import write_recording
 from hydrotele.show.rerun_stream import open_recording
+from hydrotele.simulate.mechanism import compile_mechanism
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def test_all_channels_are_there(chunks, log):
 
 
 def test_bodies_move_as_in_mujoco(chunks, machine, log):
-    model = compile_visual_model(machine)
+    model = compile_mechanism(machine)
     poses = body_poses(machine, model, extract_joint_motion(machine, log))
     for body in ("boom", "stick_rod", "bucket_coupler"):
         index = model.body(body).id

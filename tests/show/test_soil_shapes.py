@@ -10,9 +10,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.scenario.surrounding_objects import read_soil_from_log
-from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
+from hydrotele.show.logged_poses import body_poses, extract_joint_motion, logged_surroundings
 from hydrotele.show.soil_shapes import make_bucket_load_mesh, make_ground_around_trench, soil_history, trench_mesh
 from hydrotele.show.video import write_video
+from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.soil.parameters import CARRIED_VOLUME, INNER_WIDTH
 
 
@@ -24,7 +25,7 @@ def dug():
 @pytest.fixture(scope="module")
 def history(dug):
     machine, log = dug.plant.machine, dug.truth
-    model = compile_visual_model(machine, surroundings=logged_surroundings(log))
+    model = compile_mechanism(machine, surroundings=logged_surroundings(log))
     poses = body_poses(machine, model, extract_joint_motion(machine, log), log)
     return soil_history(machine, read_soil_from_log(log)[0], log, poses)
 

@@ -9,7 +9,7 @@ from hydrotele.kinematics.drive_linkage import axis_linkage, has_ball_ends
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.reduced_mechanism import make_reduced_mechanism
 from hydrotele.simulate.closed_loops import close_loops, compute_loop_closure_error, holding_forces
-from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document, tilt_joint_name
+from hydrotele.simulate.mechanism import compile_mechanism, tilt_joint_name
 
 TILT = np.radians(1.0)
 
@@ -23,7 +23,7 @@ def tilted():
 
 @pytest.fixture(scope="module")
 def placed(tilted):
-    model = mjcf_document(assemble_mjcf(tilted, 1e-3, ground=False, visuals=False)).compile()
+    model = compile_mechanism(tilted, ground=False, visuals=False)
     return model, mujoco.MjData(model)
 
 

@@ -9,8 +9,9 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.scenario.surrounding_objects import LogOnGround
-from hydrotele.show.logged_poses import body_poses, compile_visual_model, extract_joint_motion, logged_surroundings
+from hydrotele.show.logged_poses import body_poses, extract_joint_motion, logged_surroundings
 from hydrotele.simulate.gripping import POCKET_CENTRE, POCKET_HALF_SIZE, timber_log_grip_parameters
+from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.simulate.plant import build_plant, rest_state
 
 END = np.array([6.03 * np.cos(np.pi / 3), 6.03 * np.sin(np.pi / 3)])  # slewed by 60 deg
@@ -104,7 +105,7 @@ def test_pick_log_puts_it_down_where_it_should():
     assert place[:, 2].max() > 1.2 and place[-1, 2] == pytest.approx(0.175, abs=1e-3)
     assert run.summary["max_pin_opening_mm"] < 0.05
     machine, truth = run.plant.machine, run.truth
-    model = compile_visual_model(machine, surroundings=logged_surroundings(truth))
+    model = compile_mechanism(machine, surroundings=logged_surroundings(truth))
     poses = body_poses(machine, model, extract_joint_motion(machine, truth), truth)
     shown = poses.bodies.index("log_0")
     np.testing.assert_allclose(poses.position[:, shown], place, atol=1e-12)

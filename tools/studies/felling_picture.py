@@ -15,11 +15,11 @@ from PIL import Image
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.logged_poses import (
-    compile_visual_model,
     compute_joint_positions,
     extract_joint_motion,
     logged_surroundings,
 )
+from hydrotele.simulate.mechanism import compile_mechanism
 
 MOMENTS = (11.0, 29.0, 38.0, 60.0, 74.0, 85.5)  # s
 SIZE = (560, 420)
@@ -27,7 +27,7 @@ COLUMNS = 3
 
 folder, picture = Path(sys.argv[1]), Path(sys.argv[2])
 machine, log = load_machine(folder / "machine.yaml"), load_log(folder / "truth.parquet")
-model = compile_visual_model(machine, surroundings=logged_surroundings(log))
+model = compile_mechanism(machine, surroundings=logged_surroundings(log))
 rows = np.searchsorted(log.time, MOMENTS)
 positions = compute_joint_positions(machine, model, extract_joint_motion(machine, log), log)[rows]
 data, camera = mujoco.MjData(model), mujoco.MjvCamera()

@@ -32,7 +32,8 @@ def make_controller(name: str, setup: TaskSetup) -> Controller:
     """Make a controller for a task.
 
     Args:
-        name: `reference`, `zero` or `random`.
+        name: `reference` for the entry of the task in REFERENCE_CONTROLLERS, `zero` for zero
+            actions, or `random` for uniform random actions.
         setup: the task with its options.
 
     Returns:
@@ -56,19 +57,22 @@ def tune_gains(
     evaluate: Callable[[dict[str, float]], float], initial_gains: Mapping[str, float], factor: float = 1.5,
     passes: int = 2, min_improvement: float = 0.0, upper_bounds: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, float], float]:  # fmt: skip
-    """Improve controller gains by a coordinate search.
+    """Improve controller gains by a coordinate search for the highest score.
+
+    One gain after the other is multiplied by `factor` as long as the score improves. If the first
+    multiplication does not improve the score, the gain is divided by `factor` instead, likewise.
 
     Args:
         evaluate: function that returns the score of a set of gains, larger is better; it must always
             use the same episodes.
         initial_gains: initial gains, all positive.
-        factor: factor by which a gain is changed, repeatedly while the score improves.
+        factor: factor by which a gain is changed in a trial.
         passes: number of passes through all gains.
-        min_improvement: minimum improvement of the score that a change must bring.
+        min_improvement: a trial is accepted only if it improves the score by more than this.
         upper_bounds: upper bounds of the gains.
 
     Returns:
-        (gains, their score).
+        (best gains, their score).
     """
     best, score = dict(initial_gains), evaluate(dict(initial_gains))
     for _ in range(passes):

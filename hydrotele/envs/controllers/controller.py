@@ -29,14 +29,14 @@ from hydrotele.scenario.scenario import Servo
 
 
 class Controller(Protocol):
-    """Compute actions from observations, for n parallel episodes."""
+    """Interface of a controller, which computes actions from observations for n parallel episodes."""
 
     def begin(self, count: int) -> None:
         """Allocate and initialise the controller state for `count` parallel episodes."""
         ...
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes that are over.
+        """Reset the controller state of some episodes, because they are over and new ones start.
 
         Args:
             mask: (n,) bool, True for the episodes to reset.
@@ -47,7 +47,7 @@ class Controller(Protocol):
         """Return the actions of this step.
 
         Args:
-            observation: (n, o).
+            observation: (n, o) observations of the n episodes.
 
         Returns:
             (n, a), in the range +-1.
@@ -81,7 +81,7 @@ class RandomController:
         self._actions, self._seed = len(setup.axes), seed
 
     def begin(self, count: int) -> None:
-        """Seed the random generator."""
+        """Create the random generator from the stored seed; `count` is not used."""
         self._rng = np.random.default_rng(self._seed)
 
     def reset(self, mask: np.ndarray) -> None:
@@ -130,11 +130,13 @@ def compute_servo_commands(servo_parameters, grid, table, reference, rate_ahead,
     """Compute the valve or drive commands of the joint servo for n episodes.
 
     Args:
-        servo_parameters: (k, 14) of `control.servo.servo_parameters`.
-        grid: (k, 2) of `control.servo.tabulate_drive_geometry`.
-        table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drive_geometry`.
-        reference: (n, k) [rad] or [m].
-        rate_ahead: (n, k) reference rates, those of a time later by the lag of the valve spool [rad/s] or [m/s].
+        servo_parameters: (k, 14) gains and drive parameters from `control.servo.servo_parameters`.
+        grid: (k, 2) lowest joint position and step of `table`.
+        table: (k, TABLE_POINTS, 3) moment arms and chamber volumes from
+            `control.servo.tabulate_drive_geometry`.
+        reference: (n, k) reference positions now [rad] or [m].
+        rate_ahead: (n, k) reference rates [rad/s] or [m/s] at a time ahead of now by the lag of the
+            valve spool.
         measured: MeasuredState with (n, k) arrays, (n,) supply pressures.
         load: (n, k) low-pass filtered drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
@@ -165,7 +167,7 @@ def compute_tip_poses(arm, q, pose):
     """Compute the tip poses of n episodes from their joint angles.
 
     Args:
-        arm: (9,) of `kinematics.task_space.arm_parameters`.
+        arm: (9,) dimensions of the arm from `kinematics.task_space.arm_parameters`.
         q: (n, k) joint angles [rad].
         pose: (n, 5) written: r [m], theta [rad], z [m], attitude [rad], head [rad].
 
@@ -180,13 +182,17 @@ def compute_tip_poses(arm, q, pose):
 
 @compiled
 def compute_joint_angles(arm, ranges, pose, q):
-    """Compute the joint angles of n episodes from tip poses; unreachable poses leave `q` unchanged.
+    """Compute the joint angles of n episodes from tip poses (inverse kinematics).
+
+    If a pose is out of reach or its joint angles are outside `ranges`, the row of `q` is not
+    changed.
 
     Args:
-        arm: (9,) of `kinematics.task_space.arm_parameters`.
-        ranges: (k, 2) of the joints [rad].
+        arm: (9,) dimensions of the arm from `kinematics.task_space.arm_parameters`.
+        ranges: (k, 2) joint ranges [rad].
         pose: (n, 5) r [m], theta [rad], z [m], attitude [rad], head [rad].
-        q: (n, k) joint angles, updated [rad].
+        q: (n, k) joint angles, updated [rad]; the new swing angle is within half a turn of the
+            previous one.
 
     Returns:
         Nothing.
@@ -207,15 +213,21 @@ _MAX_INTEGRAL = 0.05  # rad/s or m/s, limit of the integral term
 
 
 class ValveServo:
-    """Joint servo that returns valve (or force drive) actions for axis references."""
+    """Joint servo with integral term that converts axis references to actions of kind `valve`.
+
+    The actions command valves, or drives without a valve.
+    """
 
     def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
-        """Read the parameters of the controller from `setup.machine`, the machine without added effects.
+        """Read the parameters of the servo from `setup.machine`, the machine without added effects.
+
+        The observation columns that the servo uses are found, too.
 
         Args:
             setup: the task with its options, with `valve` actions.
             servo: gains of the joint servo.
-            integral_gain: gain of the integral term [1/s^2].
+            integral_gain: gain of the integral of the position error [1/s^2]; the result is added
+                to the reference rate, with at most 0.05 rad/s or m/s.
         """
         machine, self._dt = setup.machine, environment_step_time(setup)
         self._axes, self._integral_gain = setup.axes, integral_gain
@@ -237,7 +249,7 @@ class ValveServo:
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new; the next call initialises their controller state."""
         self._is_new |= mask
 
     def __call__(self, observation: np.ndarray, reference: np.ndarray, rate_ahead: np.ndarray) -> np.ndarray:
@@ -245,11 +257,12 @@ class ValveServo:
 
         Args:
             observation: (n, o).
-            reference: (n, k) reference positions [rad] or [m].
-            rate_ahead: (n, k) reference rates, those of a time later by the lag of the valve spool [rad/s] or [m/s].
+            reference: (n, k) reference positions now [rad] or [m].
+            rate_ahead: (n, k) reference rates [rad/s] or [m/s] at a time ahead of now by the lag of
+                the valve spool.
 
         Returns:
-            (n, k) actions.
+            (n, k) actions: commands divided by the command limit of each drive.
         """
         seen, joint = observation.astype(float), observation[:, self._joint].astype(float)
         head, rod = np.zeros_like(joint), np.zeros_like(joint)

@@ -26,10 +26,17 @@ _POSE_GAINS = (4.0, 1.0)  # 1/s, the same for the tip pose
 
 
 class PoseFollower:
-    """Track a moving tip pose with an arm that has no further driven axes."""
+    """Controller that makes the tip track a moving reference pose, with any kind of actions.
+
+    All driven axes must belong to the arm.
+    """
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
+        """Create the controller for the kind of actions of the setup.
+
+        It is a `ValveServo` for valve actions, otherwise a `RateFeedback` for joint rates or tip
+        rates. Its parameters are those of `setup.machine`, the machine without added effects.
+        """
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_specification(setup.machine)
         self._dt, self._k = environment_step_time(setup), k
@@ -54,7 +61,7 @@ class PoseFollower:
         self._q, self._is_new = np.zeros((count, self._k)), np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new; the next call initialises their controller state."""
         (self._valve_servo or self._rate_feedback).reset(mask)  # pyright: ignore - one of them is there
         self._is_new |= mask
 
@@ -64,7 +71,9 @@ class PoseFollower:
         Args:
             observation: (n, o).
             pose: (n, k) reference pose of the tip: r [m], theta [rad], z [m], attitude [rad].
-            rate: (n, k) rate of the reference pose.
+            rate: (n, k) rate of the reference pose [m/s], [rad/s]. Only tip-rate actions use it;
+                the others use the difference between the joint references of this step and the
+                last.
 
         Returns:
             (n, k) actions.
@@ -127,7 +136,7 @@ class GradeController:
     """Controller that cuts the ground down to the target plane in passes of at most 0.15 m depth."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the observation columns that the controller uses."""
+        """Find the observation columns that the controller uses, and create the follower of the reference pose."""
         self._tip = find_observation_columns(setup, "tip", COORDINATES[:4])
         self._errors = find_observation_columns(setup, "profile_error", [str(p) for p in range(SECTION_COUNT)])
         self._mass, self._edge, self._plane, self._slope = (
@@ -146,12 +155,15 @@ class GradeController:
         self._is_new, self._goal = np.ones(count, bool), np.full((count, 3), np.inf)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new; the next call initialises their controller state."""
         self._follower.reset(mask)
         self._is_new |= mask
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Compute the actions (n, 4) of the next step from the observations (n, o) of n parallel episodes."""
+        """Compute the actions (n, 4) of the next step from the observations (n, o) of n parallel episodes.
+
+        The phases and the reference pose of the tip advance by one step.
+        """
         seen = observation.astype(float)
         tip, errors = seen[:, self._tip][:, [0, 2, 3]], seen[:, self._errors]
         fresh = self._is_new
@@ -165,7 +177,17 @@ class GradeController:
         return self._follower(seen, pose, np.insert(self._reference_rate, 1, 0.0, axis=1))
 
     def _update_phases(self, tip: np.ndarray, errors: np.ndarray, mass: np.ndarray, edge: np.ndarray):
-        """Switch every episode whose phase is finished to its next phase, and choose the radii of the next cut."""
+        """Switch every episode whose phase is finished to its next phase, and choose the radii of the next cut.
+
+        The phases are APPROACH, LOWER, DRAW (cut towards the machine), CURL, CARRY and DUMP. The
+        radii are updated from the uneven sections of the profile until APPROACH ends.
+
+        Args:
+            tip: (n, 3) measured r [m], z [m] and attitude [rad] of the tip.
+            errors: (n, SECTION_COUNT) heights of the profile sections above the target plane [m].
+            mass: (n,) mass carried [kg].
+            edge: (n,) height of the bucket's edge above the ground [m].
+        """
         self._phase_time += self._dt
         phase, place = self._phase, self._reference
         waiting = np.sqrt(np.mean(errors**2, axis=1)) < _FLAT_ERROR
@@ -198,7 +220,12 @@ class GradeController:
         self._phase_time[done] = 0.0
 
     def _compute_phase_targets(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the tip targets (n, 3) of the phases, r [m], z [m], attitude [rad], and their rate limits (n, 3)."""
+        """Return targets of the tip (n, 3) in the current phases, and limits of its rates (n, 3).
+
+        The columns are r [m], z [m] and attitude [rad]; the limits are per second. `seen` (n, o)
+        are the observations and `errors` (n, SECTION_COUNT) the heights of the profile sections
+        above the plane [m].
+        """
         phase, place = self._phase, self._reference
 
         def plane(r: np.ndarray) -> np.ndarray:
@@ -230,9 +257,11 @@ class GradeController:
         return goal, fast
 
     def _advance_reference(self, goal: np.ndarray, fast: np.ndarray, tip: np.ndarray) -> None:
-        """Move the reference pose of the tip towards `goal` (n, 3) by one step, with rates up to `fast` (n, 3).
+        """Move the reference pose of the tip towards `goal` by one step, with rates up to `fast`.
 
-        It stays within the reach of the arm and within a maximum distance from the measured `tip` (n, 3).
+        Both are (n, 3), with columns r [m], z [m] and attitude [rad]. The reference stays within
+        the reach of the arm and within a maximum distance from the measured `tip` (n, 3). The
+        reference rates are updated, too.
         """
         wanted = np.clip(_POSITION_GAIN * (goal - self._reference), -fast, fast)
         drawn = (self._phase == DRAW) | (self._phase == LOWER)

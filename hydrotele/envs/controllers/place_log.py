@@ -1,7 +1,8 @@
 """Reference controller of the task `PlaceLog`: a sequence of moves without residual swing.
 
-Every move has a trapezoidal speed profile. Its ramps last one period of the grapple's pendulum
-motion, so the grapple does not swing after them. If the log is lost, the sequence starts again.
+Every move has a trapezoidal speed profile. If a move swings the grapple, its ramps last one period
+of the grapple's pendulum motion, so the grapple does not swing after it. If the log is lost, the
+sequence starts again.
 """
 
 import math
@@ -71,7 +72,11 @@ def find_pin_and_grapple_columns(setup: TaskSetup) -> np.ndarray:
 
 
 class MovePlanner:
-    """Plan the motion of the stick's pin, the grapple rotation and the jaw, phase by phase."""
+    """Planner of the motion of the pin at the stick's tip, of the grapple rotation and of the jaw.
+
+    Every episode passes through the phases APPROACH to LEAVE, with one move and one pause per
+    phase.
+    """
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read rate limits and geometry from `setup.machine`, and find the observation columns that are used."""
@@ -92,11 +97,14 @@ class MovePlanner:
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new; the next update plans their first move."""
         self._is_new |= mask
 
     def update(self, seen: np.ndarray) -> None:
-        """Advance the plan by one step; at the end of a move, start the next phase. `seen` (n, o) are observations."""
+        """Advance the plan by one step; after a move and its pause, plan the move of the next phase.
+
+        `seen` (n, o) are the observations.
+        """
         fresh = self._is_new.copy()
         self._move_end[fresh], self._phase[fresh], self._is_new[:] = (
             seen[fresh][:, self._tip],
@@ -110,21 +118,29 @@ class MovePlanner:
         self._plan_moves(seen, over)
 
     def reference_ahead(self, ahead: float) -> np.ndarray:
-        """Return the reference (n, 5) `ahead` [s] from now.
+        """Return the reference (n, 5) of the current moves at a time `ahead` [s] after now.
 
-        The columns are r [m], theta [rad], z [m] of the pin, grapple rotation [rad] and jaw [rad].
+        The columns are r [m], theta [rad], z [m] of the pin, grapple rotation [rad] and jaw angle
+        [rad].
         """
         share = trapezoidal_move_fraction(self._time + ahead, self._length, self._ramp)[:, None]
         return self._move_start + share * (self._move_end - self._move_start)
 
     def _next_phases(self, seen: np.ndarray) -> np.ndarray:
-        """Return the phases (n,) that follow the current ones: RELEASE if the log was lost, else the next in order."""
+        """Return the phases (n,) that follow the current ones, from observations `seen` (n, o).
+
+        The next phase in order follows, and APPROACH follows the last. RELEASE follows if the log
+        is not held after CLOSE, LIFT or SLEW.
+        """
         following = (self._phase + 1) % (LEAVE + 1)
         lost = (seen[:, self._held] < 0.5) & np.isin(self._phase, (CLOSE, LIFT, SLEW))
         return np.where(lost, RELEASE, following)
 
     def _plan_moves(self, seen: np.ndarray, which: np.ndarray) -> None:
-        """Plan the move of the present phase, from the last target, for the episodes of the mask `which` (n,)."""
+        """Plan the move of the present phase for the episodes of the boolean mask `which` (n,).
+
+        The move starts at the target of the last move. `seen` (n, o) are the observations.
+        """
         if not which.any():
             return
         phase, goes = self._phase[which], self._move_end[which].copy()
@@ -150,9 +166,10 @@ class MovePlanner:
         return theta - np.arcsin(self._lateral_offset / r)
 
     def _plan_grip_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target (m, 5) of the open grapple above the log, aligned with it; `goes` is the last target.
+        """Return the target (m, 5) of the open grapple above the log, aligned with it.
 
-        The columns are those of `reference_ahead`.
+        `seen` (m, o) are observations and `goes` (m, 5) the last targets. The columns are those of
+        `reference_ahead`.
         """
         r, theta, sine, cosine = seen[:, self._log].T
         to = goes.copy()
@@ -168,9 +185,10 @@ class MovePlanner:
         return to
 
     def _plan_lay_down_target(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target (m, 5) that brings the held log over its goal with the goal yaw.
+        """Return the target (m, 5) that brings the held log over its goal position with the goal yaw.
 
-        The columns are those of `reference_ahead`; height and jaw stay those of the last target `goes`.
+        `seen` (m, o) are observations and `goes` (m, 5) the last targets, whose height and jaw
+        angle are kept. The columns are those of `reference_ahead`.
         """
         r, theta, sine, cosine = seen[:, self._log].T
         goal_r, goal_theta, goal_sine, goal_cosine = seen[:, self._goal].T
@@ -189,7 +207,7 @@ class MovePlanner:
 
 
 class PlaceByTip:
-    """Track the planned moves by rates of the pin (`resolved_motion`)."""
+    """Controller that tracks the moves of a `MovePlanner` by rates of the pin (actions `resolved_motion`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
@@ -209,7 +227,7 @@ class PlaceByTip:
         self._rate_feedback.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new in the planner and in the feedback loops."""
         self.planner.reset(mask)
         self._rate_feedback.reset(mask)
 
@@ -223,7 +241,7 @@ class PlaceByTip:
 
 
 class PlaceByAxes:
-    """Track the planned moves by axis rates (`joint_rate`) or valve commands (`valve`)."""
+    """Controller that tracks the moves of a `MovePlanner` by axis rates (`joint_rate`) or valve commands (`valve`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
@@ -241,13 +259,17 @@ class PlaceByAxes:
                 part.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new in the planner and in the feedback loops."""
         for part in (self.planner, self._rate_feedback, self._valve_servo):
             if part:
                 part.reset(mask)
 
     def _axis_references_ahead(self, ahead: float, joint: np.ndarray) -> np.ndarray:
-        """Return the axis references (n, 5) `ahead` [s] from now; `joint` (n, 5) is measured."""
+        """Return the axis references (n, 5) at a time `ahead` [s] after now.
+
+        `joint` (n, 5) are the measured positions, which replace the arm references if the pose is
+        unreachable.
+        """
         places, q = self.planner.reference_ahead(ahead), joint[:, :3].copy()
         pose = np.zeros((len(places), MAX_ARM_AXES))
         pose[:, :3] = places[:, :3]

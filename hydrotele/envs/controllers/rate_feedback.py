@@ -11,9 +11,11 @@ from hydrotele.envs.task_setup import TaskSetup
 class RateFeedback:
     """Compute rate commands that make positions track references, with feedback of a modelled position.
 
-    Control loops of the environment track the commanded rates. They are slow, so the measured position
-    cannot be fed back with a high gain. The model integrates the commanded rates without lag, so its
-    position can. It is corrected slowly towards the measured position.
+    The command is the reference rate plus a gain times the difference between reference position
+    and modelled position. The model integrates the commanded rates with the acceleration limits of
+    the environment. It has no lag, so this gain can be high. The control loops of the environment
+    are too slow for a high gain on the measured position, which only corrects the modelled position
+    slowly.
     """
 
     def __init__(self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains) -> None:
@@ -21,10 +23,10 @@ class RateFeedback:
 
         Args:
             setup: the task with its options.
-            fastest: (k,) rates at full action.
-            accelerations: (k,) acceleration limits.
-            gains: position gain of the model, gain of its correction towards the measured position
-                [1/s].
+            fastest: (k,) rates at full action [rad/s] or [m/s].
+            accelerations: (k,) acceleration limits of the modelled rates [rad/s^2] or [m/s^2].
+            gains: (gain of reference minus modelled position, gain of measured minus modelled
+                position by which the model is corrected) [1/s].
         """
         self._tracking_gain, self._correction_gain = gains
         self._fastest, self._dt = fastest, environment_step_time(setup)
@@ -38,19 +40,19 @@ class RateFeedback:
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
+        """Mark the episodes of the boolean mask (n,) as new; their model restarts at the next measured position."""
         self._is_new |= mask
 
     def compute_rate_commands(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Return the rate commands, scaled to +-1.
+        """Return the rate commands as fractions of the rates at full action, and advance the model by one step.
 
         Args:
-            measured: (n, k) measured positions.
-            place: (n, k) reference positions.
-            rate: (n, k) reference rates.
+            measured: (n, k) measured positions [rad] or [m].
+            place: (n, k) reference positions [rad] or [m].
+            rate: (n, k) reference rates [rad/s] or [m/s].
 
         Returns:
-            (n, k) commands.
+            (n, k) commands, clipped to +-1.
         """
         self._model_position[self._is_new] = measured[self._is_new]
         self._model_rate[self._is_new], self._is_new[:] = 0.0, False

@@ -44,7 +44,7 @@ class ReferencePreview:
     """
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the observation columns and invert the interpolation matrix."""
+        """Find the observation columns of the references and invert the interpolation matrix."""
         ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEW_TIMES]
         self._columns = [
             find_observation_columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)
@@ -63,7 +63,7 @@ class ReferencePreview:
 
 
 class TrackByValves:
-    """Track the axis references by valve commands of the joint servo, with an integral term.
+    """Controller that tracks the axis references by valve commands of the joint servo, with an integral term.
 
     The reference rates are taken from a time slightly ahead, which compensates the lag of the valves.
     """
@@ -98,7 +98,7 @@ class TrackByValves:
 
 
 class TrackByJointRates:
-    """Track joint references by joint rates."""
+    """Controller that tracks the axis references by joint rates (`joint_rate`), with `RateFeedback`."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the controller from `setup.machine`, the machine without added effects."""
@@ -114,7 +114,7 @@ class TrackByJointRates:
 
 
 class TrackByResolvedMotion:
-    """Track the tip pose that corresponds to the joint references by tip rates."""
+    """Controller that tracks, by tip rates, the tip pose that corresponds to the joint references."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the controller from `setup.machine`, the machine without added effects.
@@ -161,7 +161,7 @@ _REACH_RATE_FRACTION = 0.6  # maximum joint rate of a reach, as a fraction of th
 
 
 class TipController:
-    """Base of the controllers that track a tip pose with any kind of actions."""
+    """Base class of the controllers that track a tip pose with any kind of actions."""
 
     def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
         """Read the parameters of the controller from `setup.machine`, the machine without added effects.
@@ -190,7 +190,10 @@ class TipController:
             self._valves.reset(mask)
 
     def solve_joint_angles(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return the joint angles (n, k) for tip poses (n, k); for unreachable poses, the measured angles."""
+        """Return the joint angles (n, k) for tip poses (n, k).
+
+        For poses that are unreachable, they are the measured angles in the observations (n, o).
+        """
         found = np.ascontiguousarray(observation[:, self._joint], float)
         whole = np.zeros((len(pose), MAX_ARM_AXES))
         whole[:, : self._k] = pose
@@ -199,7 +202,10 @@ class TipController:
 
 
 class LineController(TipController):
-    """Track a line by the rate of the reference a short time ahead, plus feedback of the tracking error."""
+    """Controller of a tip that follows the observed reference pose of a line.
+
+    It commands the rate of the reference a short time ahead plus feedback of the tracking error.
+    """
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
@@ -227,7 +233,7 @@ class LineController(TipController):
 
 
 class ReachController(TipController):
-    """Move the tip to the goal pose at rates proportional to the remaining error."""
+    """Controller that moves the tip to the goal pose at rates proportional to the remaining error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses."""
@@ -272,7 +278,11 @@ _FORCE_GAIN = 2.0e-6  # m/s per N: a loop gain of 2 /s on 1e6 N/m
 
 
 class PressController:
-    """Lower the tip to the plate; in contact, set its vertical speed proportional to the force error."""
+    """Controller that presses on the plate, with actions `resolved_motion`.
+
+    Without contact it lowers the tip at constant speed. In contact, its vertical speed is
+    proportional to the force error.
+    """
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses.
