@@ -30,6 +30,7 @@ if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
 
 from hydrotele.core.files import models_folder  # noqa: E402
 from hydrotele.machine import machine_file  # noqa: E402
+from hydrotele.show import report_html  # noqa: E402
 from hydrotele.simulate import mechanism  # noqa: E402
 
 
@@ -61,6 +62,7 @@ def _share_machines():
 
 
 _share_machines()
+report_html._DPI = 50  # pictures of reports are drawn in a third of the time
 
 # No deadline: the first example pays for numba's compilation. The same examples each time, so
 # that a red run can be repeated.

@@ -88,6 +88,7 @@ HISTORY = re.compile(
     re.IGNORECASE,
 )
 _PHRASE = re.compile("|".join(rf"(?P<i{k}>\b(?:{p})\b)" for k, p in enumerate(IDIOMS)), re.I)
+_DEFINITION = re.compile(r"\s*(?:def|class) (\w+)")
 _CODE = re.compile(r"`[^`]*`")
 _TEMPLATE_CODE = re.compile(r"\{%.*?%\}|\{\{.*?\}\}|\{#.*?#\}", re.S)
 _SENTENCE_END = re.compile(r"(?<=[.!?:;])[*\"]*\s+(?=[A-Z`\[*a-z0-9(+-])")
@@ -156,14 +157,14 @@ def check_page(path: str, text: str) -> Iterator[Finding]:
 
 def check_module(path: str, source: str) -> Iterator[Finding]:
     """Find unclear names, and idioms in docstrings, comments and messages of a module."""
-    tree = ast.parse(source)
-    docstrings = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            docstrings.add(id(node.value))
-        if isinstance(node, ast.FunctionDef | ast.ClassDef) and is_lone_word(node.name):
-            yield Finding(path, node.lineno, "name", "code", node.name)
-    for node in ast.walk(tree):
+    for number, line in enumerate(source.splitlines(), 1):
+        if (match := _DEFINITION.match(line)) and is_lone_word(match[1]):
+            yield Finding(path, number, "name", "code", match[1])
+    if not _PHRASE.search(source):
+        return
+    nodes = list(ast.walk(ast.parse(source)))
+    docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             is_docstring = id(node) in docstrings
             if is_docstring or len(node.value.split()) >= MIN_MESSAGE_WORDS:
