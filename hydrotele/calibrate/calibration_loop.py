@@ -101,10 +101,12 @@ def link_chain(values: np.ndarray) -> SerialChain:
     """Build the serial chain of consecutive links; its joint coordinates are sensor angles plus offsets.
 
     Args:
-        values: (k, 5) rows of `CalibrationLoop.values`; the offsets are not used.
+        values: (k, 5) rows of `CalibrationLoop.values`; the offsets are not used, because they are part
+            of the joint coordinates.
 
     Returns:
-        A chain of k joints with 5 parameters per link: offset, d, a, alpha, beta.
+        A chain of k joints with 5 parameters per link: offset (0, only for derivatives), d, a, alpha,
+        beta.
     """
     return _build_chain(len(values), values.tobytes())
 

@@ -34,7 +34,8 @@ def read_calibration_poses(
 
     Args:
         path: folder of logs, run folder, or one log.
-        machine: the machine with its calibrator.
+        machine: the machine with its calibrator, a passive arm with angle sensors from the tool to
+            the chassis.
         loop: the closed chain of this machine and its calibrator.
         max_poses: maximum number of poses per log.
         accuracy: standard deviation of an angle reading [rad]. By default it is that of the sensor
@@ -88,7 +89,8 @@ def log_to_poses(
 
     Args:
         log: log of one moving link.
-        machine: the machine with its calibrator.
+        machine: the machine with its calibrator, a passive arm with angle sensors from the tool to
+            the chassis.
         loop: the closed chain of this machine.
         max_poses: maximum number of poses.
         accuracy: standard deviation of an angle reading [rad]. None for that of the sensor set

@@ -126,7 +126,7 @@ def compare_models(
     if target is not None:
         check_output_folder(target, "compare")
     stop_profiling_clock()
-    named = {name: load_machine_for_logs(data, find_machine_folder(name), tool) for name in machines}
+    named = {name: load_machine_for_logs(data, find_corrected_machine_folder(name), tool) for name in machines}
     dataset = load_dataset(
         list(data), next(iter(named.values())), sensors, heldout, force=force
     )  # fmt: skip
@@ -150,7 +150,7 @@ def compare_models(
     return document
 
 
-def find_machine_folder(name: str) -> str:
+def find_corrected_machine_folder(name: str) -> str:
     """Return the subfolder with the corrected machine of a result folder of `gap` or `identify`.
 
     Any other name or folder is returned unchanged.

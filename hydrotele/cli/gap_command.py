@@ -268,8 +268,9 @@ def find_mechanism_files(
     if path is None or not path.is_file() or (path.parent / MACHINE_FILE).is_file():
         if columns is not None:
             raise InputError(
-                "--columns", "is used only together with --mjcf: give both"
-            )  # fmt: skip
+                "--columns",
+                "applies to mechanisms only: give --mjcf or a shipped model without machine.yaml, such as palida",
+            )
         return None, None
     beside = path.parent / "columns.yaml"
     return path, columns or (beside if beside.is_file() else None)

@@ -304,7 +304,7 @@ def gap(
     mjcf: Annotated[Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
+        typer.Option("--columns", help="For a mechanism: assignment of log columns (.yaml)."),
     ] = None,
     heldout: HeldOutOption = None,
     sensors: SensorsOption = None,

@@ -62,7 +62,7 @@ def review_logs(
         if path and path.suffix.lower() != suffix:
             raise InputError(path, f"the name must end in {suffix}")
     if time is not None and not screenshot:
-        raise InputError("--at", "is the time of a screenshot: give --screenshot FILE.png as well")
+        raise InputError("--at", "sets the time of the screenshot: give --screenshot FILE.png as well")
     if plot:
         with announce_output("plot", plot):
             _plot(first, second, machine, tool, plot, force)

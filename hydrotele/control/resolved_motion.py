@@ -125,6 +125,8 @@ class ResolvedMotion:
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.
         pose: reference r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
+            The attitude is the angle of the last link (tool or stick) in the plane of the arm. The
+            head rotates the tool sideways.
         is_blocked: whether the references were held in the last step, at a limit of workspace or
             joints.
     """

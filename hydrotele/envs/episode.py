@@ -104,9 +104,9 @@ TASK_PARAMETERS = np.dtype(
         ("ranges", _F, (MAX_AXES, 2)),  # joint ranges of the axes [rad], [m]
         ("servo", _F, (MAX_AXES, 14)),  # see control.servo.servo_parameters
         ("feedforward", _F),
-        ("grid", _F, (MAX_AXES, 2)),  # see control.servo.tabulate_drives
+        ("grid", _F, (MAX_AXES, 2)),  # see control.servo.tabulate_drive_geometry
         ("accuracy", _F, MAX_CHANNELS),  # bound of the uniform random error of every sensor
-        ("converters", _F, (3, MAX_CHANNELS)),  # see machine.machine.channel_converter
+        ("converters", _F, (3, MAX_CHANNELS)),  # see machine.sensors.make_channel_converter
         ("parameters", _F, MAX_PARAMETERS),  # task parameters
         ("delayed_command", _I),  # control periods in the command ring buffer, 0 without delays
         ("delayed_sensor", _I),  # physics steps in the sensor ring buffer, 0 without delays
@@ -126,7 +126,7 @@ TASK_PARAMETERS = np.dtype(
         ("truncated", _I),
         ("measures", _I),  # (n, MAX_MEASURES)
         ("final_measures", _I),  # (n, MAX_MEASURES) before an autoreset in the same step
-        ("table", _I),  # (k, TABLE_POINTS, 3) of control.servo.tabulate_drives
+        ("table", _I),  # (k, TABLE_POINTS, 3) of control.servo.tabulate_drive_geometry
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
         ("users", _I),  # (v, k SLOT_COUNT) actuator parameters
@@ -141,7 +141,7 @@ TASK_PARAMETERS = np.dtype(
         ("places", _I),  # (fields, 3): address of all variants, address of all n, floats per row
         ("terrain", _I),  # (n, width)
         ("eq_rows", _I),  # (n, neq eq_width) equality data, 0 if no task writes them
-        ("task", _I),  # native code of the task, see `world`
+        ("task", _I),  # address of the task's native code, see envs.task_parameters.TASK_CODES
         ("mj_step", _I),
         ("mj_set_state", _I),
         # offsets of members in mjData and mjModel [byte]

@@ -62,7 +62,7 @@ def check_render_mode(mode: str | None, known: list[str]) -> None:
         InputError: the mode is not in the list.
     """
     if mode is not None and mode not in known:
-        raise InputError(f"render_mode {mode!r}", f"choose one of {', '.join(known)}, or none")
+        raise InputError(f"render_mode {mode!r}", f"choose one of {', '.join(known)}, or leave it out")
 
 
 def add_render_fps(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:

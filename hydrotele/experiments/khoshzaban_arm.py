@@ -72,8 +72,9 @@ NOMINAL_LENGTHS = {"p_z.swing": -0.840, "p_xy.swing": 2.160, "a.swing": 0.340, "
            "d.boom": -0.110, "a.stick": 1.800}  # fmt: skip
 """Table 2 (p. 56) [m]."""
 
-# Tables 4 (p. 59), 5 and 6 (p. 61): identified lengths [m] with the signs of LENGTHS, twists
-# minus those of Table 2 [deg], and iterations of links 3, 2 and 1.
+# Tables 4 (p. 59), 5 and 6 (p. 61): identified lengths [m] in the order and with the signs
+# of LENGTH_PARAMETERS, twists minus those of Table 2 [deg] in the order of TWIST_PARAMETERS, and
+# iterations of links 3, 2 and 1.
 PUBLISHED_LENGTHS = {
     "drift": (-0.908, 2.160, 0.306, 5.188, -0.110, 1.797),
     "sensor": (-0.913, 2.161, 0.298, 5.199, -0.100, 1.796),

@@ -40,8 +40,8 @@ from hydrotele.experiments.statistical_checks import (
 )
 from hydrotele.machine.machine_file import load_machine
 
-# Tables 7 (p. 63) and 9 (p. 70): lengths [m] in the order and with the signs of LENGTHS, twists
-# minus those of Table 2 [deg] in the order of TWISTS.
+# Tables 7 (p. 63) and 9 (p. 70): lengths [m] in the order and with the signs of LENGTH_PARAMETERS,
+# twists minus those of Table 2 [deg] in the order of TWIST_PARAMETERS.
 _PRINTED_LENGTHS = {
     "identified": (-0.623, 2.122, 0.011, 5.485, 0.001, 1.868),
     "reidentified": (-0.699, 2.122, 0.401, 5.312, -0.059, 1.848),
@@ -272,8 +272,9 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the parameter errors without the bent poses with Khoshzaban 1992, Table 9.
+    """Compare the errors of the reidentified parameters with Khoshzaban 1992, Table 9.
 
+    The parameters are identified after removal of the poses in which gravity bends joints.
     The published RMS errors of the lengths and of the twists of links 0 to 3 must lie in the central 95 %
     of the repetitions.
     """

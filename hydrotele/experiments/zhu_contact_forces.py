@@ -157,7 +157,7 @@ def _describe_held_forces(samples: Sequence[Sample]) -> str:
     )
 
 
-def _evaluate_stiffness_feedback(samples: Sequence[Sample]) -> Evaluation:
+def _evaluate_operators_within_jnd(samples: Sequence[Sample]) -> Evaluation:
     check = check_fraction(
         f"operators whose force is within {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} % of both targets",
         collect_values(samples, "error") < JUST_NOTICEABLE_DIFFERENCE,
@@ -401,7 +401,7 @@ STIFFNESS_FEEDBACK = (
             ' force"',
             "p. 96, Fig. 6.49",
             "document",
-            _evaluate_stiffness_feedback,
+            _evaluate_operators_within_jnd,
             {"pilot.reflection": "none"},
             "no reflection",
         ),

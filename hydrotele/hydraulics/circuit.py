@@ -426,8 +426,10 @@ def _relief_limited_rate(margin, rate, relief_rate, dt):
 def _rate_with_air(user, u, pressure, rate, dt):
     """Convert a mean pressure rate of oil without released air to that with released air [Pa/s].
 
-    `pressure` is the chamber pressure with air at the start of the step of length dt. The rate is
-    unchanged if the pressure is above atmosphere at both ends of the step.
+    `pressure` is the chamber pressure with air at the start of the step of length dt [Pa above
+    atmosphere]. The rate is unchanged if the oil has no dissolved air, or if `pressure` and
+    `pressure` plus dt times `rate` are both at least -onset. The onset is the pressure deficit at
+    which the oil releases air [Pa].
     """
     release, onset = user[u + _AIR], user[u + _ONSET]
     if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
@@ -440,9 +442,11 @@ def _rate_with_air(user, u, pressure, rate, dt):
 def _predicted_softening(user, u, pressure, rate, dt):
     """Return the factor by which released air reduces the derivatives of a pressure rate [1].
 
-    It is `laws.air_softening_factor` at the start of the step. It is 1 if the chamber `pressure`
-    [Pa] is above atmosphere at the start, or would be above at the end. `rate` is the pressure rate
-    without released air [Pa/s].
+    It is `laws.air_softening_factor` at the start of the step. It is 1 if no air is released at the
+    start, because the oil has no dissolved air or the chamber `pressure` [Pa above atmosphere] is
+    at least -onset. It is also 1 if the air dissolves again within the step: the pressure without
+    released air at the start, plus dt times its `rate` [Pa/s], is above -onset. The onset is the
+    pressure deficit at which the oil releases air [Pa].
     """
     release, onset = user[u + _AIR], user[u + _ONSET]
     if pressure >= -onset or release == 0.0:

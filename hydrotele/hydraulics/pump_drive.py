@@ -285,10 +285,11 @@ def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """Return the friction of a pump drive's piston at the end of a step, including sticking.
 
     Dry friction adds to viscous friction with the coefficient b. The dry friction is
-    `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder retracts. m is the
-    friction coefficient of the load cylinder, A its area and F_r its return force. If the dry
-    friction can make the velocity after the step, `v + dt/M (F - F_f)`, zero, it does. With dt = 0
-    the friction is that at the current velocity; at rest it balances F as far as possible.
+    `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder retracts. The load
+    cylinder pushes against the piston: m is its friction coefficient, A its area and F_r its return
+    force. M is the mass moved by the drive. These four are in `user`. If the dry friction can make
+    the velocity after the step, `v + dt/M (F - F_f)`, zero, it does. With dt = 0 the friction is
+    that at the current velocity; at rest it balances F as far as possible.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.

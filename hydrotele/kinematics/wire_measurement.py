@@ -145,8 +145,8 @@ def wire_jacobian(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
         pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6, 6): row k is (u_k, (R p_k) x u_k), with the direction u_k of wire k from its anchor to
-        the platform point p_k and the platform's rotation R.
+        (..., 6, 6): row k is (u_k, (R p_k) x u_k): u_k is the unit vector of wire k from its anchor to
+        its platform point, p_k this point in the platform frame, R the rotation of the platform.
     """
     arms = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT_OF_WIRE)])
     away = arms + pose.position[..., None, :] - np.array(wires.anchors)

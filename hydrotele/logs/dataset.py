@@ -52,7 +52,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
     )
 
 
-def logged_predicted_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
+def channels_predicted_and_logged(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
     """Return the channels that the model of a machine predicts and at least one run contains.
 
     Raises:
@@ -391,7 +391,7 @@ def make_complete_logs(files: Sequence[RunFiles], merged: "MergedRuns", machine:
         merged: the result of `merge_runs` for them.
         machine: the machine.
     """
-    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), channels_predicted_and_logged(files, machine)
     by_name, logs = {run.name: run for run in files}, []
     first = [channels.index(c) for axis in axes if (c := f"{machine.position_kind(axis)}.{axis}") in channels]
     for name, rows in merged.pieces.items():
@@ -546,7 +546,7 @@ def make_dataset(
     files = [remove_truth(run) for run in files]
     for run in files:
         check_commands(run, machine)
-    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), channels_predicted_and_logged(files, machine)
     check_mask_runs(masks, [run.name for run in files])
     known, notes = determine_sensors(files, machine, sensors)
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
@@ -621,7 +621,7 @@ def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[Mask
             than 30 % of the rows are missing, or most values of a channel are outside the range of
             the machine.
     """
-    axes, channels = tuple(actuator_order(machine)), logged_predicted_channels(files, machine)
+    axes, channels = tuple(actuator_order(machine)), channels_predicted_and_logged(files, machine)
     pieces, origin, notes = {}, {}, []
     for run in files:
         parts, said = merge_run(run, axes, channels, masks)

@@ -82,6 +82,8 @@ def check_mask_runs(masks: Sequence[MaskedInterval], runs: Sequence[str]) -> Non
 def find_unmasked_rows(masks: Sequence[MaskedInterval], run: str, time: np.ndarray) -> np.ndarray:
     """Return for each row of a run whether it is outside all masked intervals (n,), from its time stamp (n,) [s].
 
+    An interval `begin <= t < end` masks the rows of its run, or of all runs if its run name is empty.
+
     >>> find_unmasked_rows([MaskedInterval("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
     [True, False, False, True]
     """

@@ -159,7 +159,11 @@ def slice_rows(rows: RunRows, first: int, last: int) -> RunRows:
 
 
 def _note_nan_cells(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
-    """Return a note on the number of NaN or empty cells per channel; an empty list without any."""
+    """Return a list with one note on a run that states its numbers of NaN or empty cells.
+
+    The note names each command and each channel in `channels` that has such cells. The list is empty if no
+    cell is missing.
+    """
     counts = {
         name: int(np.isnan(log[name]).sum())
         for log in logs for name in log.columns

@@ -220,9 +220,10 @@ _AXES = tuple(enumerate("xyz"))
 
 
 def _split_joint(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
-    """Convert MuJoCo's joint j to hinges and slides, with start positions from a pose `qpos` (nq,).
+    """Convert MuJoCo's joint j to hinges and slides, with start positions from `pose`, a vector `qpos` (nq,).
 
-    A ball joint gives three hinges, and a free joint three slides and three hinges.
+    A ball joint gives three hinges about x, y and z in this order (Cardan angles), and a free joint
+    three slides before them. Hinges and slides are kept.
     """
     name, kind = model.joint(j).name or f"joint{j}", model.jnt_type[j]
     body, anchor = int(model.jnt_bodyid[j]), tuple(model.jnt_pos[j])

@@ -3,14 +3,11 @@
 It also finds the time intervals in which they are significant.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.gap.result import Prediction
-
-if TYPE_CHECKING:
-    pass
 
 WINDOW_DURATION = 0.5  # s, duration of a window
 _FALSE_ALARM_PROBABILITY = 1e-3  # probability that a perfect model has any gap window in a run

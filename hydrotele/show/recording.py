@@ -28,18 +28,6 @@ from hydrotele.show.rerun_stream import entity_path, open_recording, time_column
 if TYPE_CHECKING:
     import rerun as rr
 
-
-if TYPE_CHECKING:
-    pass
-
-
-if TYPE_CHECKING:
-    import rerun as rr
-
-
-if TYPE_CHECKING:
-    import rerun as rr
-
 _ENTRY_NAME = re.compile(r"[a-z][a-z0-9_]*")
 _RESERVED_NAMES = ("about", "difference", "ground")
 _WHITE_FRACTION = 0.65  # fraction of white in the line colours of all logs but the first

@@ -11,13 +11,7 @@ from hydrotele.show.channels import (
 )
 
 if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
     import rerun.blueprint as rrb
-if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
-    pass
 
 # {tab: kinds of its plots, from top to bottom}
 _TAB_KINDS: Mapping[str, tuple[str, ...]] = {

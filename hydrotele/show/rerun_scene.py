@@ -32,12 +32,6 @@ from hydrotele.simulate.mechanism import compile_mechanism
 
 if TYPE_CHECKING:
     import rerun as rr
-if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
-    import rerun as rr
-if TYPE_CHECKING:
-    import rerun as rr
 
 _GHOST_COLOUR = np.array([40.0, 130.0, 255.0])
 _GHOST_TINT = 0.7  # fraction of the ghost colour in the displayed colour

@@ -14,12 +14,6 @@ from hydrotele.core.output import atomic_file
 
 if TYPE_CHECKING:
     import rerun as rr
-if TYPE_CHECKING:
-    pass
-if TYPE_CHECKING:
-    import rerun as rr
-if TYPE_CHECKING:
-    import rerun as rr
 
 _MAX_ID_LENGTH = 180  # maximum number of characters of an application id in rerun
 

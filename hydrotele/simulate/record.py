@@ -76,7 +76,7 @@ def start_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     mujoco.mj_integratePos(model, data.qpos, data.qvel, model.opt.timestep)
 
 
-def current_aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+def positions_one_step_earlier(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the current positions (nq,), moved back by one step to the time of the activations.
 
     Positions from the first ball or free joint on (trees and logs) are not moved back.

@@ -255,7 +255,8 @@ def _drive_frequency_responses(tip: TipModel, servo: Servo, clocks: SamplingPeri
 
 
 _WHERE = "linear case"
-MOTION_BANDWIDTH_RATIO = 2.0  # bandwidth of the motion estimate over that of the force estimate (`station`)
+# bandwidth of the motion estimate over that of the force estimate, as in `teleoperation_system`
+MOTION_BANDWIDTH_RATIO = 2.0
 STRUCTURES = ("rate_force", "position_force", "rate_position", "position_position")
 
 
@@ -541,7 +542,10 @@ def build_scenario_case(
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TeleopPilot):
-        raise InputError(f"scenario {scenario.name}", "has no teleoperated pilot to analyse")
+        raise InputError(
+            f"scenario {scenario.name}",
+            "has no pilot of kind teleop (an operator at a joystick) to analyse; choose a teleoperated scenario",
+        )
     if not pilot.ratio > 0.0:
         raise InputError("pilot.ratio", "no force is reflected; set a ratio, such as 1e-5")
     coordinates = COORDINATES[: len(arm_axes(machine))]

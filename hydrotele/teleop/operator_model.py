@@ -378,8 +378,9 @@ class OperatorModel:
 
         The hand force is the target contact force `goal` [N] times the reflection ratio, in the
         direction `way`, and is built up gradually. It is written to the muscles' `correction`. The
-        position reference follows the handle's position at the tick `reflex`, so that the operator
-        controls a force and no position. `axis` is the joystick axis, and `row` are its parameters.
+        position reference follows the handle position at the control tick `reflex`, one reflex delay
+        before the present one, so that the operator controls a force and no position. `axis` is the
+        joystick axis, and `row` are its parameters.
         """
         share = 1.0 - math.exp(-self._step / _FORCE_BUILDUP_TIME)
         wish = way * row[REFLECTION_RATIO] * goal

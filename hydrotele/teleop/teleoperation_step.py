@@ -221,7 +221,7 @@ STATION_DTYPE = np.dtype(
     + [(name, np.int64) for name in ("touching", "contacts")],
     align=True,
 )
-"""Sizes and addresses of the arrays of a Station."""
+"""Sizes and addresses of the arrays of a `TeleoperationSystem`."""
 
 
 @compiled

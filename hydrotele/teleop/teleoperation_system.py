@@ -354,9 +354,10 @@ class _FrozenSensor:
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
-        """Replace the reading in `seen` by its value at the start of the fault, from that time on.
+        """Hold the reading in `seen` at its value in the first call at or after the start of the fault.
 
-        `time` is the present time [s]. For a joint sensor the measured joint rate is set to 0.
+        Before that, `seen` is unchanged. `time` is the present time [s]. While a joint sensor is held,
+        the measured joint rate is 0.
         """
         readings = getattr(seen, self._name)
         if time < self._start_time:

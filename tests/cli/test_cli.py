@@ -483,7 +483,7 @@ def test_review_writes_every_file_that_is_named(finished, tmp_path, monkeypatch)
     assert code == 0 and all(file.is_file() for file in files) and out.count("written to") == 3
     assert shots == [(files[2], 0.25)]
     code, _, err = invoke("review", finished, "--at", 0.25)
-    assert code == 2 and err == "--at: is the time of a screenshot: give --screenshot FILE.png as well"
+    assert code == 2 and err == "--at: sets the time of the screenshot: give --screenshot FILE.png as well"
     code, _, err = invoke("review", finished, "--video", tmp_path / "a.avi")
     assert code == 2 and err.endswith("a.avi: the name must end in .mp4")
 

@@ -16,7 +16,7 @@ from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import current_aligned_positions, start_leapfrog
+from hydrotele.simulate.record import positions_one_step_earlier, start_leapfrog
 
 CAT = load_machine("cat215", "bucket")
 REAL = "khoshzaban1992"
@@ -48,7 +48,7 @@ def felt_in_plant(machine, kind, force, command, seconds):
             mujoco.mj_step(plant.model, data)
         head, rod = np.zeros(len(plant.axes)), np.zeros(len(plant.axes))
         head[: plant.hydraulic], rod[: plant.hydraulic] = data.act.reshape(-1, 4)[:, 2:].T
-        joint = current_aligned_positions(plant.model, data)[plant.qpos]
+        joint = positions_one_step_earlier(plant.model, data)[plant.qpos]
         out.append(felt.update(joint, head, rod).copy())
         tips.append(data.site_xpos[site.id].copy())
     return np.array(out), np.array(tips)

@@ -16,7 +16,7 @@ from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.closed_loops import holding_forces, independent_dofs
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
-from hydrotele.simulate.record import current_aligned_positions, start_leapfrog
+from hydrotele.simulate.record import positions_one_step_earlier, start_leapfrog
 
 MACHINE = load_machine("cat215")
 GAP = 0.02
@@ -60,7 +60,7 @@ def test_the_rotor_crosses_the_gap_before_the_load_moves():
     for step in range(4000):
         data.ctrl[0] = 0.4 if step < 2000 else -0.4
         mujoco.mj_step(plant.model, data)
-        q = current_aligned_positions(plant.model, data)
+        q = positions_one_step_earlier(plant.model, data)
         lead.append(q[rotor] - q[ring])
         load.append(q[ring])
         if alone and lead[-1] < GAP / 2:
@@ -190,7 +190,7 @@ def motion(machine, timestep, seconds=3.0):
     start_leapfrog(plant.model, data)
     rows = []
     for row in range(round(seconds / 0.02)):
-        rows.append(current_aligned_positions(plant.model, data)[plant.qpos])
+        rows.append(positions_one_step_earlier(plant.model, data)[plant.qpos])
         data.ctrl[:] = 0.35 * np.sin(1.5 * 0.02 * row * np.array([1.7, 2.3, 2.9][: len(data.ctrl)]))
         mujoco.mj_step(plant.model, data, nstep=round(0.02 / timestep))
     return np.array(rows)

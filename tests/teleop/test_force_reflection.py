@@ -82,7 +82,7 @@ def test_json_of_another_coordinate():
     [
         (["press_direct", "--delay", "0.1"], "apply to cases only"),
         (["--coordinate", "z"], "apply to scenarios only"),
-        (["zhu_up"], "no teleoperated pilot"),
+        (["zhu_up"], "no pilot of kind teleop"),
     ],
 )
 def test_wrong_words(words, message):
