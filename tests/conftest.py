@@ -70,26 +70,27 @@ hypothesis.settings.register_profile("hydrotele", deadline=None, derandomize=Tru
 hypothesis.settings.load_profile("hydrotele")
 
 
-# Files that take five seconds or more, the longest first: two processes then end together. A file
+# Files that take three seconds or more, the longest first: two processes then end together. A file
 # that is missing here costs at most its own length at the end.
 LONG = (
-    "cli/test_cli.py", "scenario/test_scenario.py", "effects/test_library.py",
-    "teleop/test_station.py", "envs/test_render.py", "run/test_sweep.py",
-    "models/test_machines.py", "gap/test_mechanism.py", "gap/test_command.py", "gap/test_find.py",
-    "run/test_run.py", "show/test_pictures.py", "teleop/test_analyse_command.py",
-    "identify/test_identification.py", "identify/test_estimation.py", "core/test_compiled.py",
-    "estimate/test_reduced_against_plant.py", "gap/test_balances.py", "estimate/test_filter.py",
-    "run/test_replay.py", "gap/test_report.py", "calibrate/test_mukca.py", "run/test_haptic.py",
-    "core/test_linking.py", "test_architecture.py", "gap/test_discover.py", "logs/test_load.py",
-    "show/test_recording.py", "run/test_live.py", "experiments/test_abdellatif2008.py",
-    "identify/test_identify_command.py", "envs/test_dm.py", "test_packaging.py",
-    "calibrate/test_hybrid.py", "multibody/test_poses.py", "simulate/test_mechanism.py",
-    "simulate/test_native.py", "control/test_endpoint_force.py", "hydraulics/test_circuit.py",
-    "simulate/test_surroundings.py", "experiments/test_wang2012.py", "effects/test_timing.py",
-    "envs/test_grade.py", "gap/test_experiment.py", "envs/test_core.py", "control/test_plan.py",
-    "cli/test_untrusted_folder.py", "effects/test_transmission.py",
-    "experiments/test_khoshzaban_dynamics.py", "gap/test_without_inputs.py",
-    "teleop/test_linear_case.py",
+    "cli/test_cli.py", "gap/test_find.py", "gap/test_mechanism.py", "scenario/test_scenario.py",
+    "teleop/test_analyse_command.py", "identify/test_estimation.py", "test_architecture.py",
+    "identify/test_identification.py", "show/test_pictures.py", "tools/test_check_english.py",
+    "run/test_sweep.py", "estimate/test_filter.py", "calibrate/test_socket_calibration.py",
+    "models/test_machines.py", "logs/test_load.py", "run/test_run.py", "estimate/test_robust.py",
+    "teleop/test_operator_identification.py", "core/test_compiled.py", "effects/test_library.py",
+    "core/test_linking.py", "teleop/test_teleoperation_system.py", "gap/test_explanation.py",
+    "identify/test_estimators.py", "experiments/test_abdellatif2008.py", "gap/test_discover.py",
+    "control/test_gravity_model.py", "identify/test_hydraulic_identification.py",
+    "identify/test_identify_command.py", "envs/test_render.py", "multibody/test_poses.py",
+    "calibrate/test_arm_command.py", "gap/test_command.py", "hydraulics/test_circuit.py",
+    "calibrate/test_hybrid_measurement.py", "cli/test_logs_alike.py", "gap/test_balances.py",
+    "haptics/test_link.py", "kinematics/test_arm_dimensions.py", "gap/test_report.py",
+    "teleop/test_linear_case.py", "envs/test_tip_controllers.py", "envs/test_grade.py",
+    "gap/test_without_inputs.py", "experiments/test_wang2012.py", "experiments/test_zhu_theory.py",
+    "calibrate/test_hybrid_calibration.py", "teleop/test_force_reflection.py", "test_packaging.py",
+    "simulate/test_surroundings.py", "gap/test_jitter.py", "effects/test_forces.py",
+    "estimate/test_reduced_against_plant.py", "identify/test_mechanism.py",
 )  # fmt: skip
 
 
@@ -105,6 +106,8 @@ def pytest_collection_modifyitems(config, items):
         absent = [item for item in items if item.get_closest_marker("real")]
         config.hook.pytest_deselected(items=absent)
         items[:] = [item for item in items if item not in absent]
+    if absent := [name for name in LONG if not (root / name).is_file()]:
+        raise pytest.UsageError(f"LONG of tests/conftest.py names files that do not exist: {absent}")
     place = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: place.get(_inside(item.path, root), len(LONG)))
 

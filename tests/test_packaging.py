@@ -96,6 +96,7 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
     assert (site / "bin" / "hydrotele").is_file()
 
 
+@pytest.mark.nightly
 def test_sdist_is_complete_and_builds_the_same_wheel(wheel, tmp_path):
     run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", tmp_path, cwd=ROOT)
     (built,) = tmp_path.glob("*.tar.gz")

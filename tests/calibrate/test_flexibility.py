@@ -85,6 +85,7 @@ def test_refit_has_intervals_of_its_noise_model(loop, clean, loads):
     assert all(stage.chi == pytest.approx(1.0, abs=0.1) for stage in better.stages)
 
 
+@pytest.mark.nightly
 def test_stiff_joints_have_no_flexibility(loop, clean, loads):
     stages = simulate(clean, loads, 3, 0.0 * BEND)
     fit = identify_arm(loop, stages)

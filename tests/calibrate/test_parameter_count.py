@@ -17,7 +17,7 @@ from hydrotele.experiments.wang_models import STRAIGHT_HEXAPOD, build_iwr_mechan
 HINGES = ("revolute", "revolute")
 
 
-@pytest.mark.daily("6-UPS-84")
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("mechanism", "count"),
     [
@@ -41,6 +41,7 @@ def test_without_loops_equation_5_is_equation_4():
         )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_slides_through_both_joints_lose_one_parameter_per_leg():
     rng = np.random.default_rng(4)
     assert identifiable_rank(STRAIGHT_HEXAPOD, rng, poses=20) == 42

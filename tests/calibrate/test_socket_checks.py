@@ -77,6 +77,7 @@ def test_far_frames_are_moved_along_their_axes():
     assert evaluate_robot(near, sockets).rms == pytest.approx(evaluate_robot(far, sockets).rms, abs=1e-11)
 
 
+@pytest.mark.nightly
 def test_the_cross_validated_error_is_that_of_the_held_out_place():
     sockets = load_sockets(UR)[0]
     held, found = predict_held_out_place(load_robot(FACTORY), sockets, "place0", SocketOptions(model="rigid"))
@@ -87,6 +88,7 @@ def test_the_cross_validated_error_is_that_of_the_held_out_place():
         assert error > 0.9e-5
 
 
+@pytest.mark.nightly
 def test_long_recordings_are_read_in_linear_time(tmp_path):
     rng = np.random.default_rng(0)
     rows = rng.uniform(-1, 1, (20_000, 6))

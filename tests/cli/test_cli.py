@@ -144,6 +144,7 @@ def test_wrong_usage_exits_with_two(words):
     assert code == 2 and "Usage" in out + err
 
 
+@pytest.mark.nightly
 def test_errors_of_the_user_exit_with_two_and_no_traceback(tmp_path):
     code, out, err = hydrotele_run("run", "zhu_upp", cwd=tmp_path)
     assert code == 2 and out == "" and "did you mean 'zhu_up'" in err and "Traceback" not in err
@@ -267,6 +268,7 @@ def test_full_disk_leaves_nothing(broken, tmp_path, monkeypatch):
     assert code == 2 and "No space left on device" in err and names(tmp_path) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("attempts", [2, pytest.param(10, marks=pytest.mark.nightly)])
 def test_killed_runs_leave_no_folder_of_the_final_name(attempts, tmp_path):
     """SIGKILL at seeded times, every second time while writing; the next run removes the rest."""
@@ -294,6 +296,7 @@ def test_killed_runs_leave_no_folder_of_the_final_name(attempts, tmp_path):
     assert names(tmp_path) == ["run"]
 
 
+@pytest.mark.nightly
 def test_interrupt_exits_with_130_and_leaves_nothing(finished_run, tmp_path):
     process = hydrotele_process("run", "hold", "--set", "duration=3000", "--no-review", "--out", tmp_path / "run")
     # A whole short run takes longer than the start of this one, whose simulation takes 30 s.
@@ -457,6 +460,7 @@ def test_long_name_is_not_broken():
     assert text.splitlines()[1] == f"  {name}" and "reward: x" in text
 
 
+@pytest.mark.nightly
 def test_quiet_prints_the_result_only(finished, tmp_path):
     code, out, err = invoke("--quiet", "review", finished, "--plot", tmp_path / "a.png")
     assert (code, err) == (0, "") and "written to" in out

@@ -34,7 +34,7 @@ def hostile(tmp_path):
     return folder
 
 
-@pytest.mark.daily("command1")
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "command",
     [

@@ -85,7 +85,7 @@ def moving(t):
     return np.array([0.3, 0.2, -0.25, 0.3]) * math.sin(2.0 * t)
 
 
-@pytest.mark.daily("free")
+@pytest.mark.nightly
 @pytest.mark.parametrize("force", [np.zeros(3), FORCE], ids=["free", "loaded"])
 def test_a_moving_arm_feels_only_what_there_is(force):
     """The dynamic estimate within 100 N, in the mean square; the static one is fifty times as far.

@@ -54,6 +54,7 @@ def test_an_excavator_at_rest_holds_its_load():
     assert abs(swing) < 100.0 and 5e4 < boom < 3e5 and abs(stick) < 3e4  # weight is on the boom
 
 
+@pytest.mark.nightly
 def test_a_model_makes_a_plain_drive_follow(tmp_path):
     """The given model, a wrong one and none: each better than the next."""
     errors = []

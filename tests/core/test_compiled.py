@@ -84,6 +84,7 @@ def test_a_changed_module_drops_the_caches_of_those_that_use_it_and_no_others(tm
     assert _run(elsewhere, cache, code)[0] == ["1.0", "12.0", "1", "1"]
 
 
+@pytest.mark.nightly
 def test_another_form_of_the_cache_is_never_read(tmp_path):
     """Also for a function whose module imports nothing of the package, such as a law."""
     package = tmp_path / "hydrotele"
@@ -135,6 +136,7 @@ def cached_module(tmp_path):
     return run, files
 
 
+@pytest.mark.nightly
 def test_damaged_cache_files_are_compiled_again_with_one_line_of_notice(cached_module):
     run, files = cached_module
     content = [file.read_bytes() for file in files]
@@ -162,6 +164,7 @@ code_cache._write_atomically = os.open = fail
 """
 
 
+@pytest.mark.nightly
 def test_a_full_disk_keeps_compiled_code_in_memory(cached_module):
     run, files = cached_module
     for file in files:
@@ -171,6 +174,7 @@ def test_a_full_disk_keeps_compiled_code_in_memory(cached_module):
     assert run(FULL_DISK) == (["2.0", "2.0", "4.0", "0", "0"], [note])
 
 
+@pytest.mark.nightly
 def test_an_unusable_cache_folder_keeps_compiled_code_in_memory(cached_module, tmp_path):
     run, _ = cached_module
     shutil.rmtree(tmp_path / "hydrotele/compiled")
@@ -180,6 +184,7 @@ def test_an_unusable_cache_folder_keeps_compiled_code_in_memory(cached_module, t
     assert run() == (["2.0", "2.0", "4.0", "0", "0"], [note])
 
 
+@pytest.mark.nightly
 def test_two_processes_compile_a_function_once(tmp_path):
     package = tmp_path / "hydrotele"
     shutil.copytree(PACKAGE / "core", package / "core")

@@ -201,6 +201,18 @@ def plain_run(machine, tool):
     return run_scenario(short(machine, tool))
 
 
+@pytest.mark.daily(
+    "cat215-bucket-internal_leakage-bucket",
+    "cat215-bucket-command_delay-bucket",
+    "cat215-bucket-coulomb_friction-bucket",
+    "cat215-bucket-link_length-bucket",
+    "cat215-bucket-payload-tool",
+    "cat215-bucket-angle_offset-bucket",
+    "cat215-bucket-pressure_offset-bucket.rod",
+    "cat215-bucket-pump_lag-supply",
+    "cat215-bucket-valve_deadband-bucket",
+    "cat215-bucket-spool_lag-bucket",
+)
 @pytest.mark.parametrize(("machine", "tool", "name", "place"), FELT)
 def test_is_felt(machine, tool, name, place):
     """A machine that has it moves, or is seen, and not as the one without it."""

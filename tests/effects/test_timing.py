@@ -47,6 +47,7 @@ def scenario(*effects, machine="cat215", rate=50, log_rate=50, duration=1.0, **m
     return Scenario(**(keys | more))  # fmt: skip
 
 
+@pytest.mark.daily("0.02-all", "0.047-boom")
 @pytest.mark.parametrize(("delay", "place"), [(0.02, "all"), (0.047, "boom"), (0.1305, "boom")])
 def test_a_delayed_command_shifts_the_spool(delay, place):
     """Spools know nothing of the load, so that the whole response is shifted.

@@ -196,6 +196,7 @@ def motion(machine, timestep, seconds=3.0):
     return np.array(rows)
 
 
+@pytest.mark.daily("cat215-joint_flexibility-boom-given1", "rig-joint_flexibility-slide-given4")
 @pytest.mark.parametrize(
     ("name", "effect", "place", "given"),
     [

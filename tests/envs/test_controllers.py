@@ -35,6 +35,7 @@ def _errors(core, controller) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.daily("resolved_motion-0.3")
 @pytest.mark.parametrize(
     ("action", "most"),
     # a tip at 1 m/s that is 50 ms late is off by 50 mm; rates of the tip are limited to less

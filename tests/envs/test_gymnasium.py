@@ -60,7 +60,7 @@ def test_the_checker_of_gymnasium_has_nothing_to_say(task, action):
         env.close()
 
 
-@pytest.mark.daily("HoldForce-valve", "PlaceLog-resolved_motion")
+@pytest.mark.daily("HoldForce-valve")
 @EVERY_TASK_AND_ACTION
 def test_random_actions_leave_no_space_and_raise_no_warning(task, action):
     options = {"action": action, "sensors": "real", "variants": 4, "control_rate": 20.0}

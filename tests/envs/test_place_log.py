@@ -72,6 +72,7 @@ def in_hand(core: TaskCore, number: int) -> np.ndarray:
     return hand.xmat.reshape(3, 3).T @ (data.body("log_0").xpos - hand.xpos)
 
 
+@pytest.mark.nightly
 def test_each_log_is_held_where_its_own_grapple_took_it_and_let_go():
     core = make(count=4)
     for number, along in enumerate((0.0, 0.6, -1.2)):
@@ -96,6 +97,7 @@ def test_each_log_is_held_where_its_own_grapple_took_it_and_let_go():
     assert max(fallen) < 0.25
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("sensors", ["ideal", "real"])
 def test_threads_company_and_episodes_before_change_no_bit(sensors):
     options = {"sensors": sensors, "duration": 0.9, "mode": SAME_STEP}

@@ -56,6 +56,7 @@ def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
     assert far.max() < 15.0
 
 
+@pytest.mark.nightly
 def test_the_way_pays_by_its_metres_and_time_costs(core):
     core.reset(np.arange(COUNT))
     before, paid, rng = sum(left(core)), np.zeros(COUNT), np.random.default_rng(0)

@@ -68,6 +68,7 @@ def env():
 DRAWN = ("TrackTrajectory", "PlaceLog")  # daily; their machines and goals differ most
 
 
+@pytest.mark.nightly
 def test_any_thread_may_render():
     env = MachineEnv("TrackTrajectory", render_mode="rgb_array", variants=1, width=64, height=48)
     env.reset(seed=0)
@@ -80,7 +81,7 @@ def test_any_thread_may_render():
         pool.submit(env.close).result()
 
 
-@pytest.mark.daily("TrackTrajectory")
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", set_nightly(hydrotele.envs.TASK_NAMES, DRAWN))
 def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(name):
     """The same picture without the goal's markers is another one."""
@@ -137,6 +138,7 @@ def test_the_goal_starts_at_the_tip_and_goes_where_the_reference_does(env):
     assert max(gaps) == 0.0 and len(way) > 10
 
 
+@pytest.mark.nightly
 def test_each_episode_is_drawn_with_its_own_machine():
     """Boom cylinders with base pins in other places, among them those of one that is not first."""
     ranges = {"x": [-0.05, 0.05], "z": [-0.05, 0.05]}
@@ -272,6 +274,7 @@ def test_a_window_without_a_screen_is_refused(monkeypatch):
         MachineEnv("TrackTrajectory", "human", variants=1)
 
 
+@pytest.mark.nightly
 def test_nothing_is_drawn_unasked_and_no_driver_says_what_to_install():
     """In a process of its own, whose OpenGL is one that Linux does not have.
 

@@ -37,6 +37,7 @@ def place(goal, time) -> tuple[np.ndarray, np.ndarray]:
     return pose, rate
 
 
+@pytest.mark.nightly
 def test_every_line_lies_in_the_workspace_and_asks_less_than_the_drives_have(core, goals):
     arm, ranges = core.parameters["arm"], core.parameters["ranges"][:4]
     fastest = [full_action_rate(core.setup.machine, axis) for axis in core.setup.axes]
@@ -97,6 +98,7 @@ def test_the_preview_is_what_is_wanted_later(core):
     assert np.allclose(slope, seen[40][:, rate], atol=0.02)
 
 
+@pytest.mark.nightly
 def test_reward_and_errors_are_those_of_the_true_tip(core):
     core.reset(np.arange(COUNT))
     rng = np.random.default_rng(3)

@@ -152,7 +152,7 @@ def beyond(found):
     }
 
 
-@pytest.mark.daily("valves", "joint_flexibility", "pump_lag", "presliding", "tank_leakage", "load_holding")
+@pytest.mark.daily("tank_leakage", "valves", "presliding")
 @pytest.mark.parametrize("case", CASES)
 def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
     name = case if "/" in case else "cat215/none"

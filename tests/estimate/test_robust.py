@@ -56,6 +56,7 @@ def test_tables_of_states_hold_for_the_shipped_machines_and_shrink_for_small_one
     assert max_valve_drive_time_step(machine) < 1e-3
 
 
+@pytest.mark.nightly
 def test_the_filter_starts_where_the_lengths_are(small):
     machine, data = small
     run = data.heldout
@@ -81,6 +82,7 @@ def test_a_small_rig_is_followed(rig):
     assert np.all((size > 0.7) & (size < 1.3)), size
 
 
+@pytest.mark.nightly
 def test_open_loop_predictions_start_from_lengths_without_stated_noise(small):
     machine, data = small
     runner = machine_runner(machine, data)(data.heldout)

@@ -106,7 +106,7 @@ CHANGES = {  # of the real machine: (path, value, places that must stand out)
 }  # fmt: skip
 
 
-@pytest.mark.daily("friction")
+@pytest.mark.nightly
 @pytest.mark.parametrize("case", CHANGES)
 def test_a_changed_machine_stands_out_in_its_law_alone(case):
     path, value, places = CHANGES[case]
@@ -124,6 +124,7 @@ def test_a_changed_machine_stands_out_in_its_law_alone(case):
     assert {k: v for k, v in known.items() if v > 2.5} == {}, "the changed model explains it"
 
 
+@pytest.mark.nightly
 def test_the_force_balance_sees_a_drive_behind_its_transmission():
     gear = Transmission(inertia=2000.0, stiffness=3e7, damping=1e5)
     real = with_value(load_machine("cat215"), "axes.swing.transmission", gear)
@@ -240,7 +241,7 @@ def test_exact_signals_leave_less_than_the_sensors_noise():
         assert max(judged(machine, log).values()) < 1.0
 
 
-@pytest.mark.daily("open_03-place1-10.0-runs0")
+@pytest.mark.nightly
 @pytest.mark.parametrize("runs", [RUNS[1:3], pytest.param(RUNS, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("case", "place", "least"),

@@ -65,6 +65,7 @@ def searching(monkeypatch, gap_of):
     return put
 
 
+@pytest.mark.nightly
 def test_the_folder_is_named_after_the_data_and_complete(site, searching):
     asked = searching("named", report=True)
     code, out, _ = invoke("gap", "--data", "site", "--no-recording")
@@ -78,6 +79,7 @@ def test_the_folder_is_named_after_the_data_and_complete(site, searching):
     assert asked["effects"] == () and asked["jobs"] == 2
 
 
+@pytest.mark.nightly
 def test_the_patched_machine_runs_and_is_replayed(site, searching):
     searching("named")
     assert invoke("gap", "--data", "site", "--no-recording")[0] == 0
@@ -118,6 +120,7 @@ def test_json_is_gap_json_and_nothing_else(site, searching):
     assert "patched" in names(site / "here") and "next_experiment.yaml" in names(site / "here")
 
 
+@pytest.mark.daily("stop1")
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), InputError("run fit_1", "the model cannot follow it")])
 def test_an_interrupted_search_keeps_its_best_answer_and_says_where(site, searching, gap_of, monkeypatch, stop):
     searching("named")
@@ -179,6 +182,7 @@ def test_errors_of_the_user(site, searching, words, message):
     assert code == 2 and message in err and names(site) == ["site"]
 
 
+@pytest.mark.nightly
 def test_notes_in_a_patched_folder_are_not_lost(site, searching):
     searching("named")
     assert invoke("gap", "--data", "site", "--no-recording")[0] == 0

@@ -111,6 +111,7 @@ def test_steps_have_sharp_edges_of_several_sizes(folder):
     assert np.ptp(np.log10(jumps[jumps > 0.15])) > 0.3
 
 
+@pytest.mark.nightly
 def test_reversals_creep_and_run(folder):
     run_ = run("cat215", EXAMPLES["reversals"], folder)
     speed = np.abs(run_.truth["truth.velocity.boom"])
@@ -126,6 +127,7 @@ def test_sweep_covers_the_stroke(folder):
     assert np.ptp(length) > 0.5 * CAT.axes["boom"].cylinder.stroke
 
 
+@pytest.mark.nightly
 def test_stairs_fill_and_empty_the_chambers(folder):
     length = run("cat215", EXAMPLES["stairs"], folder).truth["length.stick"]
     assert np.ptp(length) > 0.6 * CAT.axes["stick"].cylinder.stroke

@@ -72,6 +72,24 @@ def test_a_filter_with_scaled_residual_inputs_is_the_linear_one(short_logs):
     assert np.all(smaller.gains.spread[there] < track.gains.spread[there] * (1.0 + 1e-9))
 
 
+def test_a_dead_band_of_the_rig_is_found_with_its_size():
+    rig = load_machine("rig")
+    true = rig.axes["slide"].valve.deadband + 0.02
+    noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
+    channels = ("position.slide", "pressure_head.slide", "pressure_rod.slide")
+    truth = rig.replace("axes.slide.valve.deadband", true)
+    data = simulate_data(truth, channels, noise, model=rig, period=0.005, rows=800, noise_stated=True)
+    gap = find_gap(data, effects=("valve_deadband", "command_delay", "payload"), jobs=1, method="regression")
+    assert gap.verdict == "named"
+    assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
+    found = gap.effects[0].parameters["deadband"]
+    assert found.low < true < found.high
+    (answer,) = gap_document(gap)["answers"]
+    assert answer["sure"][:1] == ["slide"]
+    assert sum(answer["laws"].values()) + answer["none"] == pytest.approx(1.0)
+
+
+@pytest.mark.nightly
 def test_a_dead_band_is_found_with_its_size(short_logs):
     gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2, method="regression")
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "stick")]
@@ -99,6 +117,7 @@ def test_a_machine_with_coloured_sensor_noise_has_no_gap():
         assert found == pytest.approx(stated, rel=0.15)  # 1000 readings with a correlation time of 8 rows
 
 
+@pytest.mark.nightly
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
     """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
     data = select_exciting_segments(load_dataset([MEASURED / "open_02"], load_machine("cat215")), 45.0)

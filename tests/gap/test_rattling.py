@@ -43,6 +43,7 @@ def test_ringing_teeth_are_found_with_inertia_and_damping_unlike_the_librarys(mo
     assert hypothesis.values(deviation)["gap"] == pytest.approx(GAP, rel=0.1)
 
 
+@pytest.mark.nightly
 def test_a_machine_without_teeth_is_not_looked_at():
     _, found = looked(load_machine("cat215"))
     assert found is None

@@ -60,6 +60,7 @@ def test_the_machine_moves(chunks):
     assert ("/measured/machine/boom", False) in chunks and ("/command/boom", False) in chunks
 
 
+@pytest.mark.nightly
 def test_without_a_patch_there_is_none(tmp_path, gap_of, heldout):
     write_gap_recording(tmp_path / "gap.rrd", gap_of("no_gap"), heldout, _AXES)
     found = _read(tmp_path / "gap.rrd")
@@ -68,6 +69,7 @@ def test_without_a_patch_there_is_none(tmp_path, gap_of, heldout):
     assert "the model has no significant errors" in text
 
 
+@pytest.mark.nightly
 def test_missing_readings_are_left_out(tmp_path, gap_of, heldout):
     gap = gap_of("no_gap")
     (before,) = gap.before

@@ -85,6 +85,7 @@ def test_every_picture_decodes(named):
         assert pixels.shape[1] > 2000 and pixels.std() > 10  # sharp on paper, not empty
 
 
+@pytest.mark.nightly
 def test_numbers_appear(named, gap_of):
     page, gap = named[0], gap_of("named")
     for piece in ("251.3", "247.9 to 254.6", f"{gap.size.before:.2f} × noise", "over 99.9 %"):

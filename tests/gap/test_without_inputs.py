@@ -52,5 +52,6 @@ def test_an_effect_stands_out_where_all_numbers_are_off():
     assert abs(hypothesis.values(deviation)["mass"] - 990.0) < 50.0  # all masses may be off by 2 %
 
 
+@pytest.mark.nightly
 def test_nothing_is_tried_where_little_is_lacking():
     assert early(load_machine("cat215")) == ()

@@ -117,6 +117,7 @@ def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
     assert stolen == ["processor time taken by the host: 0.4 s, 2 % of all cores"]
 
 
+@pytest.mark.nightly
 def test_garbage_is_collected_again_afterwards():
     assert gc.isenabled()
     with reduce_timing_jitter(0) as priority:
@@ -124,6 +125,7 @@ def test_garbage_is_collected_again_afterwards():
     assert gc.isenabled() and gc.get_freeze_count() == 0
 
 
+@pytest.mark.nightly
 def test_idle_processors_are_kept_awake_meanwhile(tmp_path, monkeypatch):
     wake = tmp_path / "wake"
     wake.touch()
@@ -136,6 +138,7 @@ def test_idle_processors_are_kept_awake_meanwhile(tmp_path, monkeypatch):
     assert str(wake.resolve()) not in after
 
 
+@pytest.mark.nightly
 def test_a_system_that_keeps_none_awake_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "_WAKE_LATENCY_FILE", tmp_path / "wake")
     with reduce_timing_jitter(0):

@@ -68,6 +68,7 @@ def complete():
     )  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_counts_of_the_complete_model(complete):
     """Of cylinders that end in pins; Khoshzaban's Table 13 has ball joints."""
     told = classify_parameters(complete.matrix.reshape(-1, 82), complete.names, complete.units)

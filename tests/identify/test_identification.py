@@ -176,6 +176,7 @@ def test_unknown_forces_everywhere_are_refused(clean):
         identify_dynamics(blind, heldout, setup)
 
 
+@pytest.mark.daily("True-0.032")
 @needs_real
 @pytest.mark.parametrize(("asymmetry", "error"), [(False, 0.041), (True, 0.032)])
 def test_emps_has_the_published_numbers(asymmetry, error):

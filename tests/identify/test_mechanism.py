@@ -92,6 +92,7 @@ def logged(folder, xml, size, frequency, noise, seed=0, rate=200.0, seconds=20.0
     return chain
 
 
+@pytest.mark.daily("xml1-0.25-0.4-0.01")
 @pytest.mark.parametrize(
     ("xml", "size", "frequency", "noise"), [(FOUR_BAR, 0.5, 0.2, 0.02), (ankle(), 0.25, 0.4, 0.01)]
 )
@@ -112,6 +113,7 @@ def test_a_closed_chain_is_identified_by_the_command(tmp_path, xml, size, freque
         assert abs(dry["value"] - truth) < 4.0 * dry["std"] + 0.02 * truth
 
 
+@pytest.mark.nightly
 def test_truth_lies_in_the_ellipsoid(tmp_path):
     logged(tmp_path, FOUR_BAR, 0.5, 0.2, 0.02)
     mechanism = load_mechanism(tmp_path / "robot.xml", tmp_path / "columns.yaml")

@@ -116,6 +116,7 @@ def test_clean_measured_logs_pass_unchanged(case):
         assert not (read[:, 5:][kept[:, 5:]] == 0.0).any()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("draws", [10, pytest.param(100, marks=pytest.mark.nightly)])
 def test_draws_of_noise_have_no_stuck_sensor(draws):
     truths = [load_log(MEASURED / "nominal_truth" / f"{run}.parquet").without_truth()

@@ -131,6 +131,7 @@ def test_linkages_close_over_the_joint_range_within_the_stroke(plant):
                 assert -1e-9 <= x <= cylinder.stroke + 1e-9, f"{name}: {where}"
 
 
+@pytest.mark.daily("calibrator-none", "cat215-bucket", "ec20-none", "eha-none", "emps-none", "rig-none")
 def test_strokes_are_used(plant):
     """Joint range and stroke agree: a range uses at least 85 % of the stroke, from near its start.
 
@@ -199,7 +200,7 @@ def test_folder_is_complete(name):
     assert f"]({name}.png)" in readme and "hydrotele export" in readme
 
 
-@pytest.mark.daily("cat325")
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "name",
     [

@@ -73,6 +73,7 @@ def scenario(**facts):
     return Scenario.model_validate(usual | facts)
 
 
+@pytest.mark.daily("2.0-zhu_up", "2.0-pick_log", "2.0-calibrate_swing", "2.0-eha_strokes")
 @pytest.mark.parametrize(
     ("seconds", "name"),
     [
@@ -98,6 +99,26 @@ def test_shipped_scenario_lasts_until_its_pilot_is_done(name):
     assert not prepare_run(asked).plan.notes
 
 
+@pytest.mark.daily(
+    "dig-None",
+    "ec20_steps-None",
+    "eha_strokes-None",
+    "emps_track-None",
+    "excitation-None",
+    "excitation_fast-10",
+    "feller_excitation-5",
+    "grapple_log-None",
+    "hold-None",
+    "press_direct-8",
+    "rig_steps-None",
+    "steps-None",
+    "tip_over-8",
+    "track_rock-5",
+    "zhu_down-None",
+    "zhu_in-None",
+    "zhu_out-None",
+    "zhu_up-None",
+)
 @pytest.mark.parametrize(
     ("name", "begun"),
     [

@@ -113,11 +113,13 @@ def test_logs_without_a_common_channel_are_refused(tmp_path, log):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.nightly
 def test_a_log_is_drawn_at_a_glance(tmp_path, log):
     plot_log(log, tmp_path / "log.png", size=(800, 600))
     assert _size(tmp_path / "log.png") == (800, 600)
 
 
+@pytest.mark.nightly
 def test_a_name_with_dollar_signs_is_no_formula(tmp_path):
     """Matplotlib raises an error for a formula that is not complete; labels of powers of ten stay formulas."""
     path = tmp_path / "log.png"

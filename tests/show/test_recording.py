@@ -105,6 +105,7 @@ def test_the_layout_is_in_the_file(tmp_path, machine, log):
     assert path.stat().st_size < 3e6
 
 
+@pytest.mark.nightly
 def test_a_machine_of_another_tool_can_stand_beside(tmp_path, machine, log):
     from hydrotele.machine.machine_file import load_machine
 

@@ -35,6 +35,7 @@ def polygon_area(corners):
     return 0.5 * abs(x @ np.roll(z, -1) - z @ np.roll(x, -1))
 
 
+@pytest.mark.nightly
 def test_soil_computed_from_the_log_is_that_of_the_run(dug, history):
     """The log has a quarter of the control ticks: 5 % for the mass, a cell's slope for the depth."""
     assert history.bed.carried_mass == pytest.approx(dug.summary["soil"]["carried_mass_kg"], rel=0.05)

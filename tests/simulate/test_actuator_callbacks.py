@@ -258,6 +258,7 @@ print("alive")
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("trials", [50, pytest.param(500, marks=pytest.mark.nightly)])
 def test_numbers_that_are_written_over_index_nothing_that_is_not_there(trials):
     assert "alive" in in_a_process_of_its_own(WRITTEN_OVER, str(trials))

@@ -131,7 +131,7 @@ def test_standing_machine_sinks_by_its_leakage(plant_of, tool):
     assert found[0] < -0.5e-3, "the boom sinks by half a millimetre per second and more"
 
 
-@pytest.mark.daily("bucket", "grapple_log")
+@pytest.mark.daily("bucket")
 @pytest.mark.parametrize("tool", TOOLS)
 def test_pins_hold_in_violent_motion(plant_of, tool):
     plant = plant_of(tool, ground=True)
@@ -153,7 +153,7 @@ def test_pins_hold_in_violent_motion(plant_of, tool):
     assert 1e-7 < widest < 1e-4
 
 
-@pytest.mark.daily("bucket")
+@pytest.mark.nightly
 @pytest.mark.parametrize("tool", ["none", "bucket"])
 def test_limits_and_ground_stand_up_to_full_pressure(plant_of, tool):
     plant = plant_of(tool, ground=True)

@@ -34,6 +34,7 @@ def test_random_commands_make_no_nan_and_no_warning():
     assert int(lines[-1].split()[2]) >= 60_000
 
 
+@pytest.mark.nightly
 def test_a_step_that_cannot_work_is_noticed():
     # 50 ms is a whole period of the stick's 20 Hz
     result = run(

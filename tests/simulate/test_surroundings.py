@@ -49,6 +49,7 @@ def test_a_plate_is_a_spring():
     assert not data.warning.number.any()
 
 
+@pytest.mark.nightly
 def test_the_force_that_is_felt_is_the_plates():
     """Of the pressures, against the simulator's: a tenth, for seals and for the tip's lever."""
     scenario = press()
@@ -110,6 +111,7 @@ def gone(scenario):
     return session, np.array(way)
 
 
+@pytest.mark.nightly
 def test_a_tree_stands_still_and_an_empty_grab_holds_nothing():
     """1 mm is what a root may give; the grab closes well in front of it."""
     buttons = [SAW, (0.2, "grab", 0.8)]
@@ -117,6 +119,7 @@ def test_a_tree_stands_still_and_an_empty_grab_holds_nothing():
     assert np.abs(way).max() < 1e-3 and session.events == []
 
 
+@pytest.mark.nightly
 def test_a_saw_that_stands_does_not_cut():
     """The head runs against the stem: it stays where it is, and nothing is cut."""
     session, way = gone(fell(4.0, [], times=(0.0, 0.2)))

@@ -93,6 +93,7 @@ def test_passive_are_equal_springs_and_the_transparent_one_without_delay():
     assert not is_passive(firm.make_port("rate_position"))
 
 
+@pytest.mark.nightly
 def test_an_analysis_agrees_with_itself():
     for structure in STRUCTURES:
         found = analyse_structure(CASE.with_delay(0.02), structure)
@@ -193,6 +194,7 @@ def test_different_delays_there_and_back():
         assert analyse_structure(uneven, structure).unstable_poles == analyse_structure(same, structure).unstable_poles
 
 
+@pytest.mark.nightly
 def test_the_document_of_the_shipped_case_is_complete():
     facts = load_teleop_case()
     found = analyse_structures(

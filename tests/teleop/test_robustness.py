@@ -140,6 +140,7 @@ def test_worst_of_drawn_hands_and_tasks():
     assert again.worst_growth_rate == pytest.approx(found.worst_growth_rate, abs=1e-3)
 
 
+@pytest.mark.nightly
 def test_everything_of_one_structure():
     line = constant_delay_ages(0.005, 0.02, 0.02)
     found = evaluate_robustness(CASE, "rate_position", line, case_impedance_ranges(FACTS), 3)

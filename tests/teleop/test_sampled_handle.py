@@ -22,6 +22,7 @@ JOYSTICK = load_joystick()
 PERIOD = 1.0 / JOYSTICK.control_rate
 
 
+@pytest.mark.daily("0.005-0.001", "0.005-0.008")
 @pytest.mark.parametrize("inertia", [1e-3, 8e-3])
 @pytest.mark.parametrize("period", [1e-3, 5e-3])
 def test_without_a_spring_the_limit_is_twice_the_inertia_by_the_period(inertia, period):
@@ -30,6 +31,7 @@ def test_without_a_spring_the_limit_is_twice_the_inertia_by_the_period(inertia, 
     assert min_stable_handle_inertia(3.0, 0.0, period) == pytest.approx(1.5 * period, rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_limits_and_inertias_are_inverse_to_each_other():
     inertia = min_stable_handle_inertia(3.0, 6.0, PERIOD)
     assert max_stable_handle_damping(inertia * 1.001, 6.0, PERIOD) == pytest.approx(3.0, rel=0.01)

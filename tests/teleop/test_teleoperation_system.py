@@ -68,11 +68,7 @@ def check_sound(run, speeds=SPEEDS):
 
 
 @pytest.mark.daily(
-    "stiffness-position-0.1",
-    "direct_force-rate-0.1",
-    "four_channel-rate-0.1",
-    "wave_variables-position-0.1",
-    "passivity_control-position-0.1",
+    "direct_force-rate-0.1", "four_channel-rate-0.1", "wave_variables-position-0.1", "passivity_control-position-0.1"
 )
 @pytest.mark.parametrize(
     ("mode", "delay"),
@@ -143,7 +139,7 @@ def test_coordinating_force_of_the_document_compares_with_the_handle(mode):
     np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
 
 
-@pytest.mark.daily("wave_variables")
+@pytest.mark.nightly
 @pytest.mark.parametrize("reflection", PASSIVE_LINES)
 def test_passive_lines_bring_place_and_force_over_a_bad_network(reflection):
     """100 ms each way, 20 ms of jitter, 2 % lost: the tip follows; the handle gives no energy.
@@ -206,6 +202,7 @@ def test_decoupled_axes_in_the_loop():
     assert turns["springs"] < 0.1 * turns["decoupled"]
 
 
+@pytest.mark.nightly
 def test_four_channels_under_position_control_are_transparent_at_rest():
     """Hand = ratio x force, place = scale x handle, in the mean over 1.5 s in contact.
 
@@ -242,6 +239,7 @@ def test_four_channels_under_rate_control_leave_a_constant_force_unfelt():
     assert abs(log.master("hand")[late, 2].mean()) < 0.1
 
 
+@pytest.mark.daily("khoshzaban1992-0.3")
 @pytest.mark.parametrize(("sensors", "near"), [("ideal", 0.05), ("khoshzaban1992", 0.3)])
 def test_impedance_finds_the_plates_stiffness(sensors, near):
     """The task at the tip is the plate's spring behind a firm contact.

@@ -110,6 +110,7 @@ def test_what_is_felt_in_a_sine_sweep(structure, turns):
         assert abs(measure_sine_impedance(case, structure, w) - expected) < 0.03 * abs(expected)
 
 
+@pytest.mark.daily("position_position", "position_force", "four_channel_position", "rate_force", "four_channel_rate")
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_predicted_stability_is_that_of_a_simulation(structure):
     """A grid of delays and of gains that reaches both kinds; at least the 95 % asked for."""

@@ -96,7 +96,7 @@ def test_an_unchanged_machine_shows_nothing(fast_run):
     assert seen(fast_run, []) < 1.0
 
 
-@pytest.mark.daily("3", "7")
+@pytest.mark.nightly
 @pytest.mark.parametrize("turn", range(len(OUTSIDE)))
 def test_every_effect_outside_the_library_shows(fast_run, turn):
     planted = draw_outside(MACHINE, turn, np.random.default_rng([3, turn]))
