@@ -62,6 +62,7 @@ def test_an_unknown_camera_is_refused_with_the_valid_ones(tmp_path, machine):
         render_machine(machine, tmp_path / "x.png", camera="drone")
 
 
+@pytest.mark.nightly
 def test_a_screenshot_shows_the_recording_without_complaints(tmp_path, recording):
     path = tmp_path / "review.png"
     assert _drawn(take_screenshot, recording, path, size=(800, 600), displayed_time=0.5) == ()
