@@ -419,9 +419,6 @@ class MachineLimits:
         """
         facts, supply = self.machine.axes[axis], self.machine.supply
         j = self.drives[i]
-        if facts.force:
-            limit = abs(facts.force.gain) * facts.force.command_limit
-            return np.abs(force) / (_MAX_FORCE_FRACTION * limit)
         assert supply is not None and facts.valve is not None
         head, rod = facts.hydraulic_drive.effective_areas
         speed = projection.rate[:, j]
