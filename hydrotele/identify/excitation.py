@@ -363,7 +363,8 @@ class MachineLimits:
         setup: definition of the regressor.
 
     Raises:
-        InputError: the machine has force drives, for which there are no default servo gains.
+        InputError: an axis has a force drive, for which there are no default servo gains, or a pump of
+            its own.
     """
 
     def __init__(self, machine: Machine, setup: RegressorSetup):
@@ -371,6 +372,11 @@ class MachineLimits:
             raise InputError(
                 _ERROR_CONTEXT, f"{', '.join(plain)} has a force drive without default servo gains:"
                 " write a scenario with a `fourier` pilot and your own `servo` gains",
+            )  # fmt: skip
+        if pumped := [name for name, axis in machine.axes.items() if axis.pump]:
+            raise InputError(
+                _ERROR_CONTEXT, f"{', '.join(pumped)} has a pump of its own, whose flow and pressure limits the"
+                " design does not know: write a scenario with a `fourier` pilot and amplitudes of your own",
             )  # fmt: skip
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))
