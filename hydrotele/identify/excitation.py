@@ -363,8 +363,8 @@ class MachineLimits:
         setup: definition of the regressor.
 
     Raises:
-        InputError: an axis has a force drive, for which there are no default servo gains, or a pump of
-            its own.
+        InputError: an axis has a force drive, for which there are no default servo gains, or a separate
+            pump.
     """
 
     def __init__(self, machine: Machine, setup: RegressorSetup):
@@ -375,8 +375,8 @@ class MachineLimits:
             )  # fmt: skip
         if pumped := [name for name, axis in machine.axes.items() if axis.pump]:
             raise InputError(
-                _ERROR_CONTEXT, f"{', '.join(pumped)} has a pump of its own, whose flow and pressure limits the"
-                " design does not know: write a scenario with a `fourier` pilot and amplitudes of your own",
+                _ERROR_CONTEXT, f"{', '.join(pumped)} has a separate pump, whose flow and pressure limits are not"
+                " known here: write a scenario with a `fourier` pilot and suitable amplitudes",
             )  # fmt: skip
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))

@@ -105,5 +105,5 @@ def test_excite_writes_a_scenario_that_runs(tmp_path):
 
 
 def test_excite_refuses_an_axis_with_its_own_pump(tmp_path):
-    with pytest.raises(InputError, match="piston has a pump of its own"):
+    with pytest.raises(InputError, match="piston has a separate pump"):
         call("excite", "eha", "--out", tmp_path / "e.yaml", "--harmonics", 2, "--starts", 1)
