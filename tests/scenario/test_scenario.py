@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.machine_copies import MachineCopies
 from hydrotele.run.run import finish_run, prepare_run, run_scenario, start_session
 from hydrotele.scenario.scenario import (
     Scenario,
@@ -362,6 +363,9 @@ def test_files_beside_the_scenario_are_found_from_anywhere(tmp_path):
     assert found.pilot.perception.file == str(here / "operator.yaml")
     assert find_scenario_joystick(found) == str(here / "joystick.yaml")
     assert found.servo.force_model == str(here / "model") == str(find_local_force_model(found))
+    plain = load_scenario(write(here / "plain.yaml", pilot=pilot))
+    in_sweep = MachineCopies().with_copied_paths(plain)  # which a worker runs in another folder
+    assert in_sweep.folder == "" and in_sweep.pilot == found.pilot
 
 
 def test_a_force_model_that_is_no_file_is_a_name(tmp_path):
