@@ -9,6 +9,7 @@ A stage is the set of poses recorded while one link moves and the other links of
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -406,7 +407,7 @@ def identify_stage(
         raise InputError(
             poses.source,
             f"{len(poses)} poses of {poses.link} are too few for {len(own_names)} parameters:"
-            f" record {len(own_names) * _MIN_EQUATIONS_PER_PARAMETER} or more, preferably 200",
+            f" record {math.ceil(0.5 * len(own_names) * _MIN_EQUATIONS_PER_PARAMETER)} or more, preferably 200",
         )
     sizes = [expected_parameter_error(loop, name) for name in own_names]
     start = np.array([parameters[name] for name in own_names])

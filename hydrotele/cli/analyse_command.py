@@ -29,7 +29,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import load_nominal_machine
-from hydrotele.scenario.scenario import Scenario, load_scenario, shipped_scenarios
+from hydrotele.scenario.scenario import Scenario, find_scenario_joystick, load_scenario, shipped_scenarios
 from hydrotele.show.teleop_text import (
     describe_stability,
     format_delay,
@@ -40,7 +40,7 @@ from hydrotele.show.teleop_text import (
 from hydrotele.teleop.analysis_document import findings_to_dict, scenario_findings_to_dict
 from hydrotele.teleop.case_analysis import TeleopFindings, analyse_structures
 from hydrotele.teleop.case_file import MAX_DELAY, TeleopCaseFile, TeleoperatorAxis, check_structures, load_teleop_case
-from hydrotele.teleop.linear_case import build_scenario_case, find_scenario_joystick
+from hydrotele.teleop.linear_case import build_scenario_case
 from hydrotele.teleop.packet_delays import load_packet_delays
 from hydrotele.teleop.robustness import case_impedance_ranges, evaluate_robustness
 from hydrotele.teleop.sampled_stability import (

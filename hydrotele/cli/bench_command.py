@@ -42,8 +42,12 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
         as_json: print the new results as JSON only.
 
     Raises:
-        InputError: the file to compare with cannot be read, or the file to save cannot be written.
+        InputError: the file to compare with cannot be read, or the file to save cannot be written, or
+            both a comparison and JSON are requested.
     """
+    if compare and as_json:
+        message = "cannot be combined with --json, which prints the new results only: omit one of them"
+        raise InputError("--compare", message)
     earlier = _read(compare) if compare else None
     if save and not save.parent.is_dir():
         raise InputError(save, f"cannot be written: {save.parent} is not a folder")

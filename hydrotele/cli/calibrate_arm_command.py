@@ -38,6 +38,7 @@ from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
+_ARM_KIND, _DESIGN_KIND = "arm calibration", "calibrator design"  # kinds of output folders
 _MAX_RESIDUAL_RATIO = 1.5  # ratio of residuals to sensor noise above which a note is printed
 
 
@@ -111,13 +112,15 @@ def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | 
         raise InputError("--method", f"{choices.method!r} is unknown; valid: joint, hierarchical")
     every = _parse_heldout_interval(choices.heldout)
     if target:
-        check_output_folder(target, "arm calibration")
+        check_output_folder(target, _ARM_KIND)
     nominal = load_machine(machine)
     with show_stages("calibrate arm", as_json) as progress:
         result = fit_arm(nominal, data, choices, every, progress or ignore_stage)
     said = arm_result_to_dict(result)
     if target:
-        write_calibration_folder(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
+        write_calibration_folder(
+            target, _ARM_KIND, said, result.calibrated, lambda folder: write_arm_report(folder, result)
+        )
     if as_json:
         print_json(said)
     else:
@@ -327,20 +330,23 @@ def print_output_folder(target: Path | None) -> None:
         stdout_console.print(f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}")
 
 
-def write_calibration_folder(target: Path, document: Mapping[str, Any], machine: Machine, write_report) -> None:
+def write_calibration_folder(
+    target: Path, kind: str, document: Mapping[str, Any], machine: Machine, write_report
+) -> None:
     """Write the results of an arm or linkage calibration to a folder, completely or not at all.
 
     Args:
         target: output folder.
+        kind: kind of the folder, a key of `OUTPUT_FILES`.
         document: content of `calibration.json`.
         machine: calibrated machine, written as `machine.yaml`.
         write_report: function of the folder that writes the report into it.
     """
-    with atomic_folder(target, "arm calibration") as folder:
+    with atomic_folder(target, kind) as folder:
         write_json(folder / "calibration.json", document)
         save_machine(machine, folder / MACHINE_FILE)
         write_report(folder)
-        summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
+        summary = {"kind": kind, "hydrotele": hydrotele.__version__}
         write_json(folder / "summary.json", summary)
 
 
@@ -371,7 +377,7 @@ def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as
     from hydrotele.calibrate.calibrator_design import evaluate_design_grid, optimize_design
 
     if target:
-        check_output_folder(target, "arm calibration")
+        check_output_folder(target, _DESIGN_KIND)
     nominal = load_machine(machine)
     loop = build_loop(nominal)
     with show_stages("calibrate design", as_json) as progress:
@@ -387,10 +393,10 @@ def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as
     if target:
         from hydrotele.show.calibration_report import draw_designs
 
-        with atomic_folder(target, "arm calibration") as folder:
+        with atomic_folder(target, _DESIGN_KIND) as folder:
             (folder / "design.png").write_bytes(draw_designs(survey, best))
             write_json(folder / "calibration.json", said)
-            summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
+            summary = {"kind": _DESIGN_KIND, "hydrotele": hydrotele.__version__}
             write_json(folder / "summary.json", summary)
     if as_json:
         print_json(said)

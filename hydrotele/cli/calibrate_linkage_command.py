@@ -34,6 +34,8 @@ from hydrotele.core.output import check_output_folder
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 
+_KIND = "linkage calibration"  # kind of the output folder
+
 
 def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None, as_json: bool) -> list[LinkageFit]:
     """Calibrate the pin positions of the cylinders that move in a folder of logs; print and write them.
@@ -56,7 +58,7 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
     if angles not in ("measured", "identified"):
         raise InputError("--angles", f"{angles!r} is unknown; valid: measured, identified")
     if target:
-        check_output_folder(target, "arm calibration")
+        check_output_folder(target, _KIND)
     nominal = load_machine(machine)
     with show_stages("calibrate linkage", as_json) as progress:
         fits = fit_linkages(nominal, data, angles, progress or ignore_stage)
@@ -68,7 +70,7 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
     if target:
         from hydrotele.show.calibration_report import write_linkage_report
 
-        write_calibration_folder(target, said, made, lambda f: write_linkage_report(fits, f / "report.html"))
+        write_calibration_folder(target, _KIND, said, made, lambda f: write_linkage_report(fits, f / "report.html"))
     if as_json:
         print_json(said)
     else:

@@ -115,6 +115,7 @@ def compile_all(processes: int | None = None) -> None:
         return
     processes = processes or len(os.sched_getaffinity(0))
     began, line = time.monotonic(), ProgressLine()
+    messages = tempfile.TemporaryDirectory()
     waiting = sorted(JOBS, key=lambda job: -job.seconds)
     running: dict[Job, tuple[float, subprocess.Popen]] = {}
     finished, spent, total = 0.0, 0.0, sum(job.seconds for job in JOBS)
@@ -122,14 +123,17 @@ def compile_all(processes: int | None = None) -> None:
         while waiting or running:
             while waiting and len(running) < processes:
                 job = waiting.pop(0)
-                running[job] = time.monotonic(), _start(job)
+                code = f"from hydrotele.cli.compile_command import run_job; run_job({job.name!r})"
+                running[job] = time.monotonic(), start_python(code, Path(messages.name, job.name))
             time.sleep(_POLL)
             for job, (start, process) in [*running.items()]:
                 if process.poll() is not None:
                     del running[job]
                     finished, spent = finished + job.seconds, spent + time.monotonic() - start
                     if process.returncode:
-                        raise InputError(f"compilation of {job.name}", _read_last_error_line(process))
+                        raise InputError(
+                            f"compilation of {job.name}", read_last_error_line(process, Path(messages.name, job.name))
+                        )
             scale = spent / finished if finished else 1.0  # time relative to `Job.seconds`
             begun = sum(min((time.monotonic() - start) / scale, job.seconds)
                         for job, (start, _) in running.items())  # fmt: skip
@@ -142,6 +146,7 @@ def compile_all(processes: int | None = None) -> None:
         for _, process in running.values():
             process.kill()
             process.wait()
+        messages.cleanup()
     for old in folder.glob("complete_*"):
         old.unlink()
     complete.touch()
@@ -160,15 +165,18 @@ def _hash_sources_and_versions() -> str:
     return text.hexdigest()[:16]
 
 
-def _start(job: Job) -> subprocess.Popen:
-    code = f"from hydrotele.cli.compile_command import run_job; run_job({job.name!r})"
-    return subprocess.Popen(
-        [sys.executable, "-P", "-c", code], stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-    )  # fmt: skip
+def start_python(code: str, errors: Path) -> subprocess.Popen:
+    """Start a Python process that executes some code; its standard error is written to the file `errors`.
+
+    A pipe that is read only after the end would block a process with more than 64 KB of warnings.
+    """
+    with errors.open("wb") as file:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", code], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=file
+        )
 
 
-def _read_last_error_line(process: subprocess.Popen) -> str:
-    assert process.stderr
-    lines = process.stderr.read().decode(errors="replace").strip().splitlines()
+def read_last_error_line(process: subprocess.Popen, errors: Path) -> str:
+    """Return the last line of the file `errors`, or the exit status of the finished process if it is empty."""
+    lines = errors.read_text(errors="replace").strip().splitlines()
     return lines[-1] if lines else f"exit status {process.returncode}"

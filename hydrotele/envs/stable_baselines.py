@@ -38,7 +38,7 @@ def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, n
         start, _, rest = what.partition("_")
         if start != "reference":
             continue
-        twins = (rest,) if rest in ("rate", "force") else ("angle", "length", "tip")
+        twins = (rest,) if rest in ("rate", "force") else ("angle", "position", "length", "tip")
         for twin in twins:
             name = f"{twin}.{where}" if where else twin
             if name in places:

@@ -369,7 +369,7 @@ def measure_stability_without_damping(changes: Changes) -> Sample:
     """Test whether four-channel rate control is stable if the master has no damping, Zhu 1994, (3.72).
 
     Args:
-        changes: `damping`: damping of the master in `unstable` and `poles` [N s/m].
+        changes: `damping`: damping of the master [N s/m].
 
     Returns:
         `unstable`: unstable fraction of 200 random characteristic polynomials (3.72). `poles`: number of
@@ -391,7 +391,7 @@ def measure_stability_without_damping(changes: Changes) -> Sample:
     case, side = make_identical_sides_case(), Impedance(mass, given["damping"], 100.0)
     whole = dataclasses.replace(case, master=side, slave=side)
     poles = count_unstable_poles(build_rate_control_port(whole), Impedance(), case.task)
-    bare = dataclasses.replace(case, hand=dataclasses.replace(case.hand, damping=0.0))
+    bare = dataclasses.replace(whole, hand=dataclasses.replace(case.hand, damping=0.0))
     seen = compare_stability(bare, "four_channel_rate", np.zeros(1), np.ones(1)).simulated[0, 0]
     return Sample({"unstable": float(np.mean(unstable)), "poles": float(poles),
                    "kick": float(seen)})  # fmt: skip
@@ -413,7 +413,7 @@ def evaluate_stability_without_damping(samples: Sequence[Sample]) -> Evaluation:
        " damping. The"
        " poles of the whole loop of identical sides are the zeros of (3.69), Z_m + C_m/(K_v s) +"
        " C_s, and of Z_m + Z_h + Z_e: the slave's controller damps them",
-       "a simulated kick of the whole loop, the master and the hand without damping, "
+       "a simulated kick of the whole loop, the hand without damping, "
        f"{'decays' if v['kick'] else 'grows'}")  # fmt: skip
 
 

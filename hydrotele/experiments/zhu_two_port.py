@@ -199,7 +199,8 @@ def compare_nyquist_with_simulation(changes: Changes) -> Sample:
     """
     given = merge_settings({"simulated_task": 1.0}, changes)
     case, right, cells = load_shipped_case(), 0, 0
-    real = dataclasses.replace(case, task=dataclasses.replace(case.task, stiffness=given["simulated_task"] * 36e3))
+    stiffness = given["simulated_task"] * case.task.stiffness
+    real = dataclasses.replace(case, task=dataclasses.replace(case.task, stiffness=stiffness))
     for structure in ("position_position", "position_force", "rate_position", "rate_force"):
         predicted = compare_stability(case, structure, _DELAYS, _GAIN_FACTORS)
         seen = predicted.simulated

@@ -76,8 +76,6 @@ _PRIORITY = 30
 (STOP_FLAG, CURRENT_SESSION, LAST_POSE, NEXT_WRENCH, LAST_ACKNOWLEDGED, RECEIVED, LOST, LATE, MALFORMED,
 SERVER_STARTS, REQUEST_TIME, POSE_SENT_TIME,
  ANSWERS, ROUNDS, INTERVALS, POSE_ARRIVAL_TIME) = range(16)  # fmt: skip
-# indices into `LinkBuffers.ramp`
-FORCE_GAIN, POSITION_SCALE, ROTATION_SCALE = range(3)
 
 
 class LinkBuffers(NamedTuple):
@@ -89,8 +87,7 @@ class LinkBuffers(NamedTuple):
         reply: (12,) wrench packet to send as integers.
         reply_real: (12,) the same memory as reals.
         count: (16,) counters [1] and times [ns]; the indices are STOP_FLAG .. POSE_ARRIVAL_TIME.
-        ramp: (3,) first element: factor 0 to 1 on the forces, which rises after a pause; the other
-            two are not used.
+        force_gain: (1,) factor 0 to 1 on the forces, which rises after a pause.
         sent: (1024,) ring buffer of the send times of wrenches [ns]; the index is the sequence
             number modulo 1024.
         answers: (n,) ring buffer of times from the arrival of a pose to the sending of its answer
@@ -106,7 +103,7 @@ class LinkBuffers(NamedTuple):
     reply: np.ndarray
     reply_real: np.ndarray
     count: np.ndarray
-    ramp: np.ndarray
+    force_gain: np.ndarray
     sent: np.ndarray
     answers: np.ndarray
     round_trip_times: np.ndarray
@@ -223,7 +220,7 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
             -1,
         )
         count[SERVER_STARTS] += 1
-        buffers.ramp[FORCE_GAIN] = 0.0
+        buffers.force_gain[0] = 0.0
     if pose[SEQUENCE] <= count[LAST_POSE]:
         count[LATE] += 1
         return False
@@ -251,12 +248,12 @@ def answer_pose_packet(buffers, mailbox, now, timespec):
     reply, out = buffers.reply, buffers.reply_real
     reply[MAGIC], reply[SESSION], reply[SEQUENCE] = WRENCH_MAGIC, pose[SESSION], count[NEXT_WRENCH]
     reply[ANSWERED_POSE] = pose[SEQUENCE]
-    reply[FORCES_ON] = 1 if buffers.ramp[FORCE_GAIN] > 0.0 else 0
+    reply[FORCES_ON] = 1 if buffers.force_gain[0] > 0.0 else 0
     m = unpack_master_state(mailbox.state)
     for part in range(2):
         size = 0.0
         for i in range(3 * part, 3 * part + 3):
-            out[WRENCH + i] = buffers.ramp[FORCE_GAIN] * m.push[i]
+            out[WRENCH + i] = buffers.force_gain[0] * m.push[i]
             size += out[WRENCH + i] ** 2
         size, most = np.sqrt(size), real[MAX_WRENCH + part]
         share = most / size if size > most else 1.0
@@ -271,7 +268,7 @@ def _compute_reflected_force(line, box, now, two, first, period):
     """Write the handle's pose into the mailbox and compute the force on the handle by the control law.
 
     The force is stored in the state of the control law, `box.state`. The caller multiplies it by
-    `line.ramp[FORCE_GAIN]`. This factor is 0 if the machine's data are older than FORCE_TIMEOUT or
+    `line.force_gain[0]`. This factor is 0 if the machine's data are older than FORCE_TIMEOUT or
     the pose is not valid; otherwise it rises to 1 within FORCE_RAMP_TIME.
 
     `line` is LinkBuffers, `box` Mailbox, `now` the time [ns], `two` (2,) work space of the clock.
@@ -303,7 +300,7 @@ def _compute_reflected_force(line, box, now, two, first, period):
     age = 1e-9 * (now - when)
     alive = when > 0 and age < FORCE_TIMEOUT
     able = np.isfinite(box.handle[0])
-    line.ramp[FORCE_GAIN] = min(1.0, line.ramp[FORCE_GAIN] + period / FORCE_RAMP_TIME) if alive and able else 0.0
+    line.force_gain[0] = min(1.0, line.force_gain[0] + period / FORCE_RAMP_TIME) if alive and able else 0.0
     fresh = share if age < REFLECTION_TIMEOUT else 0.0
     step_master(unpack_master_parameters(box.parameters), box.handle[:7], packet, fresh, period, first, state)
 
@@ -444,7 +441,7 @@ class HapticLink:
             raise InputError(where, f"cannot be reached ({error.strerror or error})") from None
         pose, reply = make_packet(POSE_WORDS), make_packet(WRENCH_WORDS)
         self.buffers = LinkBuffers(
-            *pose, *reply, np.zeros(16, np.int64), np.zeros(3), np.zeros(_MAX_SENT_TIMES, np.int64),
+            *pose, *reply, np.zeros(16, np.int64), np.zeros(1), np.zeros(_MAX_SENT_TIMES, np.int64),
             np.zeros(_MAX_SAMPLES, np.int64), np.zeros(_MAX_SAMPLES, np.int64),
             np.zeros(_MAX_SAMPLES, np.int64), np.zeros(2),
         )  # fmt: skip

@@ -3,7 +3,8 @@
 It serves one machine at a time: the last one that asked while no other was connected. The safety
 checks are here, next to the hardware. A wrench is limited to the device's maximum. A wrench that is
 not finite, arrives out of order or answers an old pose is rejected. The force is switched off if no
-wrench is accepted for `WATCHDOG_TIMEOUT`, or if the machine reports that it is not in control.
+wrench is accepted for `WATCHDOG_TIMEOUT`, or if the machine reports that it is not in control. If the
+device does not answer, the force is off until the machine answers a pose that was read after that.
 """
 
 import contextlib
@@ -135,13 +136,15 @@ class DeviceSession:
             max(1, round(MAX_POSE_AGE / period)),
         )
         self._forces_on, self.answered = False, -1
+        self._last_failed_pose = -1
 
     def apply_wrench_and_read_pose(self, now: int) -> None:
         """Run one period: check the timeouts, apply the wrench, write the handle's pose to `pose`.
 
         Without an accepted packet the force is switched off after WATCHDOG_TIMEOUT, and the machine
         is disconnected after CLIENT_TIMEOUT. If the device does not answer, the packet states that
-        it cannot apply forces, its pose is NaN, and the wrench is set to zero.
+        it cannot apply forces and its pose is NaN. The force is switched off until a packet answers a
+        later, valid pose: wrenches computed before the failure could push a handle that has moved.
 
         Args:
             now: current time [ns].
@@ -162,7 +165,8 @@ class DeviceSession:
             whole[BUTTONS], real[CAN_APPLY_FORCE] = buttons, 1.0
         except OSError:
             real[POSITION:TRAVEL], real[CAN_APPLY_FORCE] = np.nan, 0.0
-            self.wrench[:] = 0.0
+            self.wrench[:], self._forces_on = 0.0, False
+            self._last_failed_pose = int(whole[SEQUENCE]) + 1
         whole[SEQUENCE] += 1
         whole[LAST_ACCEPTED], whole[SENT] = self._last_wrench, now
         whole[MISSED], whole[UNANSWERED] = self.missed, self.unanswered
@@ -170,9 +174,10 @@ class DeviceSession:
     def accept_packet(self, data: bytes | memoryview, sender: Address, now: int) -> bool:
         """Check a packet from a machine, and use it if it is valid.
 
-        A valid wrench packet replaces `wrench`, limited to the device's maximum; it sets zero if
-        the machine is not in control. A valid connection request makes its sender the connected
-        machine. A rejected packet is only counted, by its reason.
+        A valid wrench packet replaces `wrench`, limited to the device's maximum. It sets zero if the
+        machine is not in control, or if it answers a pose of before the device's last failure. A
+        valid connection request makes its sender the connected machine. A rejected packet is only
+        counted, by its reason.
 
         Args:
             data: bytes of the packet.
@@ -193,7 +198,8 @@ class DeviceSession:
             self.wrench[:] = 0.0
             return True
         self._last_wrench, self.answered = int(whole[SEQUENCE]), int(whole[ANSWERED_POSE])
-        self._last_packet_time, self._forces_on = now, whole[FORCES_ON] == 1
+        self._last_packet_time = now
+        self._forces_on = whole[FORCES_ON] == 1 and self.answered > self._last_failed_pose
         self.wrench[:] = limit_wrench(real[WRENCH:], self._limits) if self._forces_on else 0.0
         return True
 

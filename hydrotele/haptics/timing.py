@@ -21,10 +21,7 @@ import numpy as np
 BUSY_WAIT_TIME = 120e-6  # s before a deadline during which a process busy-waits
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 HISTOGRAM_EDGES_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
-_PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = (
-    29,
-    41,
-)  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
+_PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = 29, 41  # options of prctl
 _WAKE_LATENCY_FILE = Path("/dev/cpu_dma_latency")  # limits the processors' wake-up latency while it is open
 _STAT_FILE, _STEAL_COLUMN = Path("/proc/stat"), 8  # index of a word in its first line: proc(5)
 
@@ -229,7 +226,8 @@ def reduce_timing_jitter(level: int) -> Iterator[bool]:
     The block runs without garbage collection, with exact sleeps, small pages and real-time
     priority. Priority and a short processor wake-up time are set only where the system permits
     them. Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
-    Afterwards normal priority, garbage collection and huge pages are restored.
+    Afterwards normal priority, the system's timer slack and huge pages are restored, and garbage
+    collection if it was on before.
 
     Args:
         level: see `request_realtime_priority`; 0 requests none.
@@ -241,6 +239,7 @@ def reduce_timing_jitter(level: int) -> Iterator[bool]:
     """
     _set_process_option(_PR_SET_TIMERSLACK, 1000)  # exact timers: by default the system wakes a thread up to 50 us late
     _set_process_option(_PR_SET_THP_DISABLE, 1)
+    collects = gc.isenabled()
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -254,8 +253,10 @@ def reduce_timing_jitter(level: int) -> Iterator[bool]:
         awake.close()
         if given:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        _set_process_option(_PR_SET_TIMERSLACK, 0)  # 0 selects the system's default
         _set_process_option(_PR_SET_THP_DISABLE, 0)
-        gc.enable()
+        if collects:
+            gc.enable()
         gc.unfreeze()
 
 

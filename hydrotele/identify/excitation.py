@@ -363,7 +363,8 @@ class MachineLimits:
         setup: definition of the regressor.
 
     Raises:
-        InputError: the machine has force drives, for which there are no default servo gains.
+        InputError: an axis has a force drive, for which there are no default servo gains, or a separate
+            pump.
     """
 
     def __init__(self, machine: Machine, setup: RegressorSetup):
@@ -371,6 +372,11 @@ class MachineLimits:
             raise InputError(
                 _ERROR_CONTEXT, f"{', '.join(plain)} has a force drive without default servo gains:"
                 " write a scenario with a `fourier` pilot and your own `servo` gains",
+            )  # fmt: skip
+        if pumped := [name for name, axis in machine.axes.items() if axis.pump]:
+            raise InputError(
+                _ERROR_CONTEXT, f"{', '.join(pumped)} has a separate pump, whose flow and pressure limits are not"
+                " known here: write a scenario with a `fourier` pilot and suitable amplitudes",
             )  # fmt: skip
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))
@@ -419,9 +425,6 @@ class MachineLimits:
         """
         facts, supply = self.machine.axes[axis], self.machine.supply
         j = self.drives[i]
-        if facts.force:
-            limit = abs(facts.force.gain) * facts.force.command_limit
-            return np.abs(force) / (_MAX_FORCE_FRACTION * limit)
         assert supply is not None and facts.valve is not None
         head, rod = facts.hydraulic_drive.effective_areas
         speed = projection.rate[:, j]

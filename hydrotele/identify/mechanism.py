@@ -306,7 +306,8 @@ def _build_record(
         out = np.interp(ticks, time[known], values[clock.row][known])
         after = np.searchsorted(time[known], ticks).clip(1, max(1, known.sum() - 1))
         apart = np.diff(time[known], prepend=time[known][0])[after.clip(0, known.sum() - 1)]
-        return np.where(apart > MAX_GAP_S, np.nan, out)
+        outside = (ticks < time[known][0] - 0.5 * period) | (ticks > time[known][-1] + 0.5 * period)
+        return np.where(outside | (apart > MAX_GAP_S), np.nan, out)
 
     def read_corrected_column(what: str, joint: str) -> np.ndarray | None:
         column = columns.get((what, joint))

@@ -54,7 +54,8 @@ def build_records(
     """Compute joint positions and drive forces of all runs from the logs of a machine.
 
     For a joint with an own sensor and a cylinder length sensor, both readings are averaged with
-    weights according to their noise.
+    weights according to their noise. A sensor without stated noise is used only where the other has no
+    reading.
 
     Args:
         dataset: logs of a machine.
@@ -239,7 +240,9 @@ def _position_channels(dataset: Dataset, axis: str) -> list[str]:
 def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
     """Compute the joint position (n,) of an axis from its sensors in a run, and its noise.
 
-    Readings of an angle and a length sensor are averaged; the noise is a standard deviation, or NaN.
+    Readings of an angle and a length sensor are averaged if both state their noise. Otherwise the one
+    that states it is preferred, and the other is used where its reading is missing. The noise is a
+    standard deviation, or NaN if neither states it.
     """
     machine = dataset.machine
     values, noises = [], []
@@ -257,13 +260,13 @@ def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.nda
     if not values:
         return np.full(len(run.command), np.nan), float("nan")
     known = np.isfinite(noises)
-    if not known.any():
-        return values[0], float("nan")
     weight = np.where(known, 1.0 / np.maximum(np.where(known, noises, 1.0), 1e-12) ** 2, 0.0)
     weights = weight[:, None] * np.isfinite(values)
     total = weights.sum(axis=0)
     out = np.nansum(weights * np.nan_to_num(values), axis=0) / np.where(total > 0, total, np.nan)
-    return out, float(weight.sum() ** -0.5)
+    for reading in values:
+        out = np.where(np.isfinite(out), out, reading)
+    return out, float(weight.sum() ** -0.5) if known.any() else float("nan")
 
 
 def _compute_joint_position(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:

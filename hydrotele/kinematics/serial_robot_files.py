@@ -242,8 +242,8 @@ def _choose_end(path: Path, ends: Sequence[_End], columns: int | None) -> _End:
         columns: number of columns of the readings, or None.
 
     Returns:
-        The chosen end. Of several with equally many joints, one with `is_last` is preferred, then
-        the one with the longest `way`, then the first.
+        The chosen end. Of several with equally many joints, one with `is_last` is preferred, then in
+        a URDF the one with the most fixed joints, then the first.
 
     Raises:
         InputError: no end has a moving joint.

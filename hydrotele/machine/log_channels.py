@@ -88,9 +88,9 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
     "flow_supply": ChannelKind(("m^3/s",), "pump flow", "none"),
     "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
-    "contact_force": ChannelKind(("N",), "contact force on the tool, base frame", "xyz"),
+    "contact_force": ChannelKind(("N",), "contact force of ground and objects on the machine, world frame", "xyz"),
     "object_contact": ChannelKind(("N",), "contact force of a plate, tree, stump or log on the machine"),
-    "tip": ChannelKind(("m",), "position of the tool tip, base frame", "xyz"),
+    "tip": ChannelKind(("m",), "position of the arm's tip, world frame", "xyz"),
 }
 
 

@@ -102,6 +102,7 @@ class SwitchedCommands:
             count: number of axes.
         """
         self.commands = [0.0] * count
+        self._next_directions = [1.0] * count
 
     def raise_command(self, number: int) -> None:
         """Increase the command of the axis with this index by one step: -1 to 0, or 0 to 1."""
@@ -114,19 +115,17 @@ class SwitchedCommands:
     def cycle_command(self, number: int) -> None:
         """Advance the command of the axis with this index in the cycle 0, 1, 0, -1.
 
-        One button then suffices for the axis. The sign of the next nonzero command is common to all
-        axes.
+        One button then suffices for the axis.
         """
         if number < len(self.commands):
             now = self.commands[number]
-            self._next_direction = -self._next_direction if now else self._next_direction
-            self.commands[number] = 0.0 if now else self._next_direction
+            if now:
+                self._next_directions[number] = -now
+            self.commands[number] = 0.0 if now else self._next_directions[number]
 
     def zero_all_commands(self) -> None:
         """Set all commands to 0."""
         self.commands = [0.0] * len(self.commands)
-
-    _next_direction = 1.0
 
     def _change_command(self, number: int, step) -> None:
         if number < len(self.commands):
@@ -531,6 +530,7 @@ def _check_time_increases(time: list[float], where: str) -> None:
 
 
 SCRIPT_PREFIX = "scripted:"
+# Values of --device, for error messages. `hydrotele drive` opens a haptic device itself.
 DEVICE_NAMES = ("keyboard", *LAYOUTS, f"{SCRIPT_PREFIX}FILE", "haptic:HOST:PORT")
 
 

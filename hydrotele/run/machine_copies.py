@@ -11,7 +11,7 @@ from hydrotele.core.datafile import read_yaml
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
 from hydrotele.machine.machine_file import find_machine_file, shipped_machines
-from hydrotele.scenario.scenario import Scenario, find_local_machine
+from hydrotele.scenario.scenario import Scenario, find_local_machine, with_absolute_paths
 
 INPUTS = "inputs"
 Files = dict[str, bytes]
@@ -41,11 +41,12 @@ class MachineCopies:
         """Return the scenario with its user machines replaced by the paths of their copies.
 
         The paths are relative to the sweep folder, and the `folder` of the scenario becomes empty.
-        The files of a new machine are read.
+        The paths of other files become absolute. The files of a new machine are read.
 
         Raises:
             InputError: a machine file cannot be read.
         """
+        scenario = with_absolute_paths(scenario)
         changes: dict = {"folder": ""}
         if own := find_local_machine(scenario):
             changes["machine"] = self._copied_machine(own).name

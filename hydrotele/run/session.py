@@ -27,7 +27,7 @@ from hydrotele.run.tick_loop import (
     run_teleoperated_ticks,
     update_max_pin_opening,
 )
-from hydrotele.scenario.scenario import Scenario
+from hydrotele.scenario.scenario import Scenario, find_local_force_model
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.conservation_checks import full_physics_state
 from hydrotele.simulate.plant import Plant
@@ -127,7 +127,9 @@ class Session:
         parameters = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
         drives = compute_drive_references(plant.machine, plan, scenario.servo)
         drives = drives._make(map(np.ascontiguousarray, drives))
-        forces = compute_force_references(nominal, plan, scenario.servo)
+        model = find_local_force_model(scenario) or scenario.servo.force_model
+        servo = scenario.servo.model_copy(update={"force_model": str(model) if model else None})
+        forces = compute_force_references(nominal, plan, servo)
         k, ticks = len(plant.axes), scenario.tick_count
         self._recorder = Recorder(plant, scenario.row_count)
         self._stepper = Stepper(plant, data, round(self._dt / scenario.timestep))

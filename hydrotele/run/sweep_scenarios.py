@@ -96,8 +96,8 @@ def _make_repetition(base: SweepBase, scenario: Scenario, repetition_number: int
 def hash_scenario(scenario: Scenario) -> bytes:
     """Return a 16-byte hash of the content of a scenario, by which a change is detected.
 
-    A result of `make_point_scenario` contains no absolute folder, so its hash does not depend on
-    where the files are.
+    A result of `make_point_scenario` contains no absolute folder of a machine, so its hash does not
+    depend on where machine files are. Paths of other files, such as a recorded motion, are absolute.
     """
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 

@@ -23,11 +23,12 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import resolve_path, scenarios_folder
+from hydrotele.core.files import models_folder, resolve_path, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.scenario.pilots import Pilot, Pose, TablePilot, check_size_limit
 from hydrotele.scenario.surrounding_objects import SurroundingObject
+from hydrotele.scenario.teleoperation import TeleopPilot
 
 
 class StartState(StrictModel):
@@ -52,7 +53,8 @@ class Servo(StrictModel):
     - `pressure_feedback` [1/s]: gain of the drive force minus its low-pass filtered value; it adds
       damping. `load_time` [s] is the time constant of this low-pass filter.
     - `force_model`: if given, inverse dynamics along the reference replace the filtered force. They are
-      those of the scenario's machine (`nominal`) or of another machine (its name or folder).
+      those of the scenario's machine (`nominal`) or of another machine (its name, or its folder relative
+      to the scenario file or to the current folder).
     """
 
     position_gain: NonNegativeFloat = 4.0
@@ -270,20 +272,78 @@ def find_local_machine(scenario: Scenario) -> Path | None:
     The path is relative to the folder of the scenario file: a machine file, or a folder that contains
     `machine.yaml`. Without such a file, the scenario's machine is a shipped one.
     """
-    path = Path(scenario.folder, scenario.machine)
-    beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
-    return path if beside else None
+    return _find_machine_beside(scenario, scenario.machine)
+
+
+def find_local_force_model(scenario: Scenario) -> Path | None:
+    """Return the path of the user's machine that `servo.force_model` names, or None if it names no such file.
+
+    The path is relative to the folder of the scenario file, or else to the current folder. Without such
+    a file, `force_model` is `nominal` or a shipped machine.
+    """
+    name = scenario.servo.force_model
+    if name is None or name == "nominal":
+        return None
+    is_own = _is_machine(Path(name)) and not _is_machine(models_folder() / name)
+    return _find_machine_beside(scenario, name) or (resolve_path(name) if is_own else None)
+
+
+def _find_machine_beside(scenario: Scenario, name: str) -> Path | None:
+    path = Path(scenario.folder, name)
+    return path if scenario.folder and _is_machine(path) else None
+
+
+def _is_machine(path: Path) -> bool:
+    return path.is_file() or (path / "machine.yaml").is_file()
+
+
+def find_scenario_joystick(scenario: Scenario) -> str:
+    """Return the path of a scenario's own joystick file, or the name of a shipped joystick.
+
+    An own file is relative to the folder of the scenario. A scenario without teleoperation has the
+    shipped `joystick`.
+    """
+    name = scenario.pilot.joystick if isinstance(scenario.pilot, TeleopPilot) else "joystick"
+    path = Path(scenario.folder, name)
+    return str(path) if name != "joystick" and path.is_file() else name
+
+
+def with_absolute_paths(scenario: Scenario) -> Scenario:
+    """Return the scenario with absolute paths of its files, so that they do not depend on its folder.
+
+    These are the user's machine, force model and joystick, the recorded motion, the trace of packet
+    delays, the operator file, and the table of a table pilot.
+    """
+    changes: dict[str, Any] = {}
+    if machine := find_local_machine(scenario):
+        changes["machine"] = str(machine)
+    if model := find_local_force_model(scenario):
+        changes["servo"] = scenario.servo.model_copy(update={"force_model": str(model)})
+
+    def with_absolute_path(part: Any, key: str) -> Any:
+        name = getattr(part, key, None)
+        return part.model_copy(update={key: str(resolve_path(Path(scenario.folder, name)))}) if name else part
+
+    pilot = scenario.pilot
+    if isinstance(pilot, TablePilot):
+        changes["pilot"] = with_absolute_path(pilot, "file")
+    elif isinstance(pilot, TeleopPilot):
+        changes["pilot"] = pilot.model_copy(update={
+            "operator": with_absolute_path(pilot.operator, "recorded"),
+            "channel": with_absolute_path(pilot.channel, "trace"),
+            "perception": with_absolute_path(pilot.perception, "file"),
+            "joystick": find_scenario_joystick(scenario),
+        })  # fmt: skip
+    return scenario.model_copy(update=changes)
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write a scenario with all its values, defaults included, as YAML that `load_scenario` can read.
 
-    The path of a user's machine is written with the scenario's folder, so that it does not depend on
-    the folder of `path`. The key `folder` is not written.
+    Files that the scenario names are written with absolute paths, so that they do not depend on the
+    folder of `path`. The key `folder` is not written.
     """
-    data = scenario.model_dump(mode="json")
-    beside = find_local_machine(scenario)
-    data["machine"] = str(beside) if beside else scenario.machine
+    data = with_absolute_paths(scenario).model_dump(mode="json")
     data.pop("folder")
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False))
 

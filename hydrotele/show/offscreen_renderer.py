@@ -233,6 +233,11 @@ def _release_context(gl: Any) -> None:
         egl.eglMakeCurrent(driver.EGL_DISPLAY, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
     elif glfw := getattr(driver, "glfw", None):
         glfw.make_context_current(None)
+    elif osmesa := getattr(driver, "osmesa", None):
+        osmesa.OSMesaMakeCurrent(None, None, driver.GL.GL_FLOAT, 0, 0)
+    elif cgl := getattr(driver, "cgl", None):
+        cgl.CGLUnlockContext(gl._context)  # `make_current` locks it: another thread would wait for ever
+        cgl.CGLSetCurrentContext(None)
 
 
 def _list_opengl_drivers() -> tuple[str, ...]:

@@ -15,13 +15,20 @@ from hydrotele.scenario.surrounding_objects import SoilGround
 from hydrotele.soil.parameters import (
     CAT215,
     CELL_LENGTH,
+    DEPTH,
+    FACE,
+    FLOOR,
     FORCE_R,
     FORCE_Z,
+    HEEL,
+    IS_INITIALISED,
     MASS,
     MOMENT,
     PROFILE_START,
     RESULT_SIZE,
+    SLIDE,
     SOILS,
+    TIP,
     WIDTH,
     Bucket,
     make_bucket_state,
@@ -111,8 +118,8 @@ class SoilBed:
         """Advance the soil while the bucket's edge moves through it.
 
         Profile, bucket state and result are updated. The first call sets the azimuth of the strip.
-        If the edge is further from the strip's middle than the width of the bucket, only the force
-        is set to 0.
+        If the edge is further from the strip's middle than the width of the bucket, the force is set to
+        0 and the position of the bucket is forgotten; profile and soil in the bucket stay.
 
         Args:
             edge: (3,) position of the edge in the world [m].
@@ -125,6 +132,8 @@ class SoilBed:
         c, s = math.cos(self.azimuth), math.sin(self.azimuth)
         if abs(c * edge[1] - s * edge[0]) > self.parameters[WIDTH]:  # swung out of the strip
             self.result[[FORCE_R, FORCE_Z, MOMENT]] = 0.0
+            # a return must not cut the soil between the places where the bucket left and entered the strip
+            self.state[[IS_INITIALISED, FACE, TIP, FLOOR, HEEL, SLIDE, DEPTH]] = 0.0
             return
         motion = EdgeMotion(
             c * edge[0] + s * edge[1], edge[2], c * velocity[0] + s * velocity[1], velocity[2],

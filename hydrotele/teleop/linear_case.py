@@ -36,7 +36,6 @@ coordinates.
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -561,16 +560,6 @@ def build_scenario_case(
     tip = linearise_tip(machine, contact.joints, wanted, scenario.servo)
     case = build_linear_case(pilot, joystick, numbers, tip, scenario.servo, clocks, contact.task)
     return case, contact
-
-
-def find_scenario_joystick(scenario: Scenario) -> str:
-    """Return the path of a scenario's own joystick file, or the name of a shipped joystick.
-
-    An own file is relative to the folder of the scenario.
-    """
-    name = scenario.pilot.joystick if isinstance(scenario.pilot, TeleopPilot) else "joystick"
-    path = Path(scenario.folder, name)
-    return str(path) if name != "joystick" and path.is_file() else name
 
 
 def _default_coordinate(pilot: TeleopPilot) -> str:

@@ -58,15 +58,15 @@ class PsychometricFunction(NamedTuple):
 
 
 @compiled
-def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
+def _simulate_exploration(muscles, hand, past, tremor, spring, load, first, felt):
     """Simulate an operator who moves a handle with stiffness `spring` and opposing force `load`.
 
-    The operator is given by `muscles` (NeuromuscularState with the reference displacement), the
-    ring buffer `past` of handle displacements and the tremor forces `tremor`; `first` is the index
-    of the first tremor sample. The force of the hand on the handle [N] and its position [m] in
-    every period are written to `felt` (n, 2).
+    The operator is given by `muscles` (NeuromuscularState with the reference displacement), mass [kg]
+    and damping [N s/m] of the hand, `hand` (2,), the ring buffer `past` of handle displacements and the
+    tremor forces `tremor`; `first` is the index of the first tremor sample. The force of the hand on
+    the handle [N] and its position [m] in every period are written to `felt` (n, 2).
     """
-    mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
+    mass, x, v = _MASS + hand[0], 0.0, 0.0
     step = _PERIOD / _SUBSTEPS
     handle = np.zeros(6)
     for k in range(len(felt)):
@@ -74,8 +74,8 @@ def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
         before = v
         compute_muscle_forces(muscles, past, tremor, handle, first + k, _PERIOD)
         for _ in range(_SUBSTEPS):
-            push = muscles.force[0] - muscles.weight[0] - muscles.arm[0] * x
-            push -= (_DAMPING + muscles.weight[1]) * v + spring * x + load
+            push = muscles.force[0] - muscles.arm[0] * x
+            push -= (_DAMPING + hand[1]) * v + spring * x + load
             v += step * push / mass
             x += step * v
         felt[k, 0] = spring * x + load + _DAMPING * v + _MASS * (v - before) / _PERIOD
@@ -85,13 +85,13 @@ def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
 def _make_operator_arm(operator: Operator, hand: HandImpedance, expected: float) -> NeuromuscularState:
     """Create the operator's arm and muscles at rest, for a handle of an expected stiffness [N/m].
 
-    The experiment uses axis 0 only.
+    The experiment uses axis 0 only. The handle moves horizontally, so that the hand has no weight.
     """
     zero = np.zeros(6)
     return copy_to_contiguous_state(NeuromuscularState(
         reference=zero, spring=zero + expected, detent=np.full((3, 6), -1.0), correction=zero,
         force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), max_force=zero + operator.max_force,
-        weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
+        weight=zero,
         gain=np.array([operator.handle_position_gain]), rest=zero, rate=zero,
         lag=discretise_neuromuscular_lag(operator.neuromuscular_frequency, 1.0, _PERIOD),
     ))  # fmt: skip
@@ -126,7 +126,9 @@ def measure_discrimination(
         muscles = _make_operator_arm(operator, hand, reference if sense == "stiffness" else 0.0)
         muscles.reference[0] = rng.uniform(*DISPLACEMENT_RANGE)
         past, handle = np.zeros((1 + round(REFLEX_DELAY / _PERIOD), 6)), np.zeros((ticks, 2))
-        _simulate_exploration(muscles, past, tremor, spring, load, int(rng.integers(2**11)), handle)
+        inertia = np.array([hand.mass, hand.damping])
+        first = int(rng.integers(2**11))
+        _simulate_exploration(muscles, inertia, past, tremor, spring, load, first, handle)
         return _mean_perception(handle[::every], errors, sense)
 
     greater = np.zeros(len(levels))

@@ -24,7 +24,7 @@ from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.sensors import SensorSet
-from hydrotele.scenario.scenario import Scenario
+from hydrotele.scenario.scenario import Scenario, find_scenario_joystick
 from hydrotele.scenario.teleoperation import Channel, SensorFault, TeleopPilot
 from hydrotele.simulate.contact_forces import make_contact_addresses, mark_surrounding_geoms, sum_contact_forces
 from hydrotele.simulate.joystick import SimulatedFlotor
@@ -92,7 +92,7 @@ class TeleoperationSystem:
         machine = plant.machine
         self._pilot, self._plan, self._data, self._feedback = pilot, plan, data, feedback
         self._period = 1.0 / scenario.control_rate
-        joystick = load_joystick(_joystick_path(scenario, pilot.joystick))
+        joystick = load_joystick(find_scenario_joystick(scenario))
         joystick = attach_operator_hand(joystick, pilot.perception, scenario.folder)
         _, axes, _ = arm_specification(machine)
         self.columns = np.array([plan.axes.index(a) for a in axes])
@@ -404,12 +404,6 @@ def _make_task_estimator(pilot: TeleopPilot, seen: Feedback, period: float, k: i
         return None
     bands = (2.0 * _force_bandwidth_hz(pilot), _force_bandwidth_hz(pilot))
     return TaskImpedance(k, period * seen.ticks_per_sample, bands, force_is_filtered=pilot.force != "true")
-
-
-def _joystick_path(scenario: Scenario, name: str) -> str:
-    """Return the path of the scenario's own joystick file, or the name of a shipped joystick."""
-    path = Path(scenario.folder, name)
-    return str(path) if name != "joystick" and path.is_file() else name
 
 
 def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> ChannelBuffers:

@@ -187,7 +187,7 @@ def test_which_link_moved():
 def test_unusable_data_say_why(clean):
     """Too few poses, only one pose, another machine, NaN, nothing moves."""
     stages = [simulate_readings(TRUE, one, None) for one in clean]
-    with pytest.raises(InputError, match="3 poses of pitch are too few"):
+    with pytest.raises(InputError, match="3 poses of pitch are too few for 4 parameters: record 4 or more"):
         identify_arm(LOOP, [stages[0].select(np.arange(3) * 40)])
     with pytest.raises(InputError, match="contains only one pose of pitch"):
         identify_arm(LOOP, [stages[0].select(np.zeros(50, int))])

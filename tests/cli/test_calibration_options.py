@@ -1,10 +1,14 @@
 """Options of `hydrotele calibrate` outside their range are refused with option, value and range."""
 
+import json
+
 import pytest
 from typer.testing import CliRunner
 
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
+
+KINDS = {"arm": "arm calibration", "linkage": "linkage calibration", "design": "calibrator design"}
 
 
 @pytest.mark.parametrize(
@@ -34,6 +38,14 @@ def test_options_out_of_range_are_refused(tmp_path, words, message):
         CliRunner().invoke(app, ["calibrate", *words.format(tmp_path / "new").split()], catch_exceptions=False)
     assert str(found.value) == message
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("words", ["arm --data .", "linkage --data .", "design"])
+def test_result_of_another_calibration_is_not_replaced(tmp_path, words):
+    for kind in {"arm calibration", "linkage calibration", "calibrator design"} - {KINDS[words.split()[0]]}:
+        (tmp_path / "summary.json").write_text(json.dumps({"kind": kind}))
+        with pytest.raises(InputError, match=f"was not written by a {KINDS[words.split()[0]]}"):
+            CliRunner().invoke(app, ["calibrate", *words.split(), "--out", str(tmp_path)], catch_exceptions=False)
 
 
 def test_noise_below_rounding_is_refused(tmp_path):

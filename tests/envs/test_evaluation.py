@@ -85,6 +85,9 @@ def test_an_agent_sees_errors_and_the_past_and_corrects_a_law():
     pairs = {(fields[a], fields[m]) for a, m in zip(asked, measured, strict=True)}
     assert ("reference.boom", "angle.boom") in pairs
     assert ("reference_rate.boom", "rate.boom") in pairs
+    sliding = core.setup._replace(fields=[f._replace(name=f"{what}.slide") for f, what in
+                                  zip(core.setup.fields, ("position", "reference"), strict=False)])  # fmt: skip
+    assert [columns.tolist() for columns in find_reference_and_measured_columns(sliding)] == [[1], [0]]
     core.reset(np.arange(3))
     view.begin(3)
     alone.begin(3)

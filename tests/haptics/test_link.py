@@ -10,7 +10,6 @@ from hydrotele.core.errors import InputError
 from hydrotele.haptics import packets
 from hydrotele.haptics.device import DeviceLimits, SimulatedDevice, SimulatedDeviceParameters
 from hydrotele.haptics.link import (
-    FORCE_GAIN,
     FORCE_RAMP_TIME,
     FORCE_TIMEOUT,
     LAST_POSE,
@@ -134,10 +133,10 @@ def test_a_server_that_starts_anew_begins_again(stand):
     for _ in range(500):
         stand.machine()
         stand.pose(x=0.01)
-    assert stand.link.buffers.ramp[FORCE_GAIN] == 1.0
+    assert stand.link.buffers.force_gain[0] == 1.0
     stand.machine()
     assert stand.pose(x=0.01, SESSION=6, SEQUENCE=0)
-    assert stand.link.buffers.count[SERVER_STARTS] == 2 and stand.link.buffers.ramp[FORCE_GAIN] < 0.01
+    assert stand.link.buffers.count[SERVER_STARTS] == 2 and stand.link.buffers.force_gain[0] < 0.01
 
 
 def test_a_device_that_is_unable_gets_no_force_and_gives_no_pose(stand):

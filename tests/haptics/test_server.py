@@ -206,6 +206,23 @@ def test_a_device_that_does_not_answer_is_told_to_be_unable():
     assert stand.period().reals[CAN_APPLY_FORCE] == 1.0
 
 
+def test_force_returns_only_with_the_answer_to_a_pose_read_after_a_failure():
+    stand = Stand(Unplugged(PERIOD))
+    stand.open()
+    before = int(stand.exchange.pose.integers[SEQUENCE])
+    stand.device.pulled = True
+    failed = int(stand.period().integers[SEQUENCE])
+    for pose in (before, failed):  # computed before the failure, or by a machine that ignores it
+        assert stand.send((1.0,) * 6, ANSWERED_POSE=pose)
+        assert not stand.exchange.wrench.any()
+    stand.device.pulled = False
+    stand.period()
+    assert not stand.device.wrench.any()
+    assert stand.send((1.0,) * 6)
+    stand.period()
+    assert stand.device.wrench.any()
+
+
 def test_the_simulated_handle_rests_where_hand_and_force_balance():
     facts = SimulatedDeviceParameters(motion_amplitudes=(0.0,) * 6)
     device = SimulatedDevice(PERIOD, facts)

@@ -2,6 +2,7 @@
 
 import gc
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -123,6 +124,25 @@ def test_garbage_is_collected_again_afterwards():
     with reduce_timing_jitter(0) as priority:
         assert not gc.isenabled() and not priority
     assert gc.isenabled() and gc.get_freeze_count() == 0
+
+
+def test_a_process_without_garbage_collection_keeps_it_off():
+    gc.disable()
+    try:
+        with reduce_timing_jitter(0):
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+@pytest.mark.skipif(not Path("/proc/self/timerslack_ns").exists(), reason="Linux only")
+def test_timers_are_exact_meanwhile_only():
+    slack = Path("/proc/self/timerslack_ns")
+    before = slack.read_text()
+    with reduce_timing_jitter(0):
+        assert int(slack.read_text()) == 1000
+    assert slack.read_text() == before
 
 
 @pytest.mark.nightly

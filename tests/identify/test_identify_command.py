@@ -102,3 +102,8 @@ def test_excite_writes_a_scenario_that_runs(tmp_path):
     assert load_scenario(file).duration == pytest.approx(7.5)
     with pytest.raises(InputError, match="yaml"):
         call("excite", "rig", "--out", Path(tmp_path / "designed.txt"), "--starts", 1)
+
+
+def test_excite_refuses_an_axis_with_its_own_pump(tmp_path):
+    with pytest.raises(InputError, match="piston has a separate pump"):
+        call("excite", "eha", "--out", tmp_path / "e.yaml", "--harmonics", 2, "--starts", 1)

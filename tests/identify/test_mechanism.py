@@ -135,6 +135,22 @@ def test_a_single_run_is_split_and_columns_with_usual_names_need_no_mapping(tmp_
     np.testing.assert_allclose(heldout.position[-1, 0], np.sin(t[-1]))
 
 
+def test_rows_before_the_first_and_after_the_last_reading_are_cut(tmp_path):
+    (tmp_path / "robot.xml").write_text(FOUR_BAR)
+    t = np.arange(0.0, 10.0, 0.01)
+    angle, torque = np.sin(t), np.cos(t)
+    angle[:30], angle[-20:], torque[:50] = np.nan, np.nan, np.nan
+    table = np.column_stack([t, angle, torque])
+    for name in ("first", "test"):
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", comments="",
+                   header="time [s],angle.crank,torque.crank")  # fmt: skip
+    mechanism = load_mechanism(tmp_path / "robot.xml")
+    (run,), heldout, _ = load_mechanism_records([tmp_path / "first.csv", tmp_path / "test.csv"], mechanism)
+    assert len(run.position) == len(heldout.position) == len(t) - 50
+    np.testing.assert_allclose(run.position[[0, -1], 0], np.sin(t[[30, -21]]))
+    assert np.isnan(run.force[:20]).all() and np.isfinite(run.force[20:]).all()  # unknown, not constant
+
+
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [

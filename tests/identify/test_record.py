@@ -58,6 +58,22 @@ def test_angle_and_length_are_weighted_by_their_noise():
     assert errors[0] == pytest.approx(fit[0].position_noise[boom], rel=0.1)
 
 
+@pytest.mark.parametrize("unknown", [["length.boom"], ["angle.boom", "length.boom"]])
+def test_a_sensor_without_stated_noise_fills_the_gaps_of_the_other(unknown):
+    data = made_up()
+    noise, reading = data.noise.copy(), data.fit[0].reading.copy()
+    noise[[data.channels.index(channel) for channel in unknown]] = np.nan
+    reading[100:110, data.channels.index("angle.boom")] = np.nan
+    run = dataclasses.replace(data.fit[0], reading=reading)
+    fit, _, _ = build_records(dataclasses.replace(data, noise=noise, fit=(run, *data.fit[1:])))
+    true = 0.45 + 0.2 * np.sin(0.7 * 0.02 * np.arange(ROWS))
+    error = fit[0].position[:, 1] - true
+    assert np.isfinite(error).all() and np.isnan(fit[0].position_noise[1]) == (len(unknown) == 2)
+    assert np.abs(error).max() < 5 * 1.5e-3  # five times the larger noise of both, over 600 rows
+    outside = np.r_[0:100, 110:ROWS]
+    np.testing.assert_allclose(fit[0].position[outside, 1], reading[outside, data.channels.index("angle.boom")])
+
+
 def test_forces_are_areas_times_pressures():
     data = made_up(noise=0.0)
     fit, _, _ = build_records(data)

@@ -14,6 +14,7 @@ from hydrotele.run.devices import (
     SWITCH_KEYS,
     JoystickDevice,
     Keyboard,
+    SwitchedCommands,
     load_script,
     open_device,
 )
@@ -131,6 +132,16 @@ def test_spacemouse_turns_a_command_on_off_and_back():
     assert mouse.read(0.0).commands == (0.0,)
     stick.axes[2] = -1.0
     assert asked(mouse.read(0.0))["z"] == 1.0  # pulled up
+
+
+def test_each_axis_has_its_own_cycle():
+    switches = SwitchedCommands(2)
+    seen = []
+    for _ in range(5):
+        for number in (0, 1):
+            switches.cycle_command(number)
+        seen.append(tuple(switches.commands))
+    assert seen == [(1.0, 1.0), (0.0, 0.0), (-1.0, -1.0), (0.0, 0.0), (1.0, 1.0)]
 
 
 def test_unplugged_pad_lets_go_says_so_once_and_comes_back():

@@ -14,8 +14,16 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.machine_copies import MachineCopies
 from hydrotele.run.run import finish_run, prepare_run, run_scenario, start_session
-from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, shipped_scenarios
+from hydrotele.scenario.scenario import (
+    Scenario,
+    find_local_force_model,
+    find_scenario_joystick,
+    load_scenario,
+    save_scenario,
+    shipped_scenarios,
+)
 from hydrotele.simulate.closed_loops import compute_loop_closure_error
 from hydrotele.simulate.record import SimulationFailed
 
@@ -356,6 +364,35 @@ def test_machine_beside_the_scenario_is_found_from_anywhere(tmp_path):
     save_scenario(first, tmp_path / "b" / "resolved.yaml")
     assert prepare_run(load_scenario(tmp_path / "b" / "resolved.yaml")).plant.machine.name == "mine"
     assert prepare_run(load_scenario(tmp_path / "b" / "s.yaml")).plant.machine.name == "rig"
+
+
+def test_files_beside_the_scenario_are_found_from_anywhere(tmp_path):
+    """All files that a scenario may name, except a table, which is read with the scenario."""
+    here = tmp_path / "a"
+    (here / "model").mkdir(parents=True)
+    for name in ("hand.csv", "wlan.csv", "operator.yaml", "joystick.yaml", "model/machine.yaml"):
+        (here / name).touch()
+    pilot = {
+        "kind": "teleop", "operator": {"recorded": "hand.csv"}, "channel": {"trace": "wlan.csv"},
+        "perception": {"file": "operator.yaml"}, "joystick": "joystick.yaml",
+    }  # fmt: skip
+    write(here / "s.yaml", pilot=pilot, servo={"force_model": "model"})
+    save_scenario(load_scenario(here / "s.yaml"), tmp_path / "saved.yaml")
+    found = load_scenario(tmp_path / "saved.yaml")
+    assert found.pilot.operator.recorded == str(here / "hand.csv")
+    assert found.pilot.channel.trace == str(here / "wlan.csv")
+    assert found.pilot.perception.file == str(here / "operator.yaml")
+    assert find_scenario_joystick(found) == str(here / "joystick.yaml")
+    assert found.servo.force_model == str(here / "model") == str(find_local_force_model(found))
+    plain = load_scenario(write(here / "plain.yaml", pilot=pilot))
+    in_sweep = MachineCopies().with_copied_paths(plain)  # which a worker runs in another folder
+    assert in_sweep.folder == "" and in_sweep.pilot == found.pilot
+
+
+def test_a_force_model_that_is_no_file_is_a_name(tmp_path):
+    for name in ("nominal", "cat215", None):
+        write(tmp_path / "s.yaml", servo={"force_model": name})
+        assert find_local_force_model(load_scenario(tmp_path / "s.yaml")) is None
 
 
 def write(path, **facts):

@@ -10,11 +10,10 @@ from hydrotele.control.state_filter import butterworth_response, filter_signal, 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.scenario.scenario import load_scenario
+from hydrotele.scenario.scenario import find_scenario_joystick, load_scenario
 from hydrotele.teleop.linear_case import (
     DEFAULT_TASK,
     build_scenario_case,
-    find_scenario_joystick,
     tip_controller_impedance,
     tip_tracking_response,
 )
