@@ -3,6 +3,7 @@
 import copy
 import ctypes
 import functools
+import gc
 import importlib.util
 import os
 import pickle
@@ -62,6 +63,7 @@ def _share_machines():
 
 
 _share_machines()
+gc.set_threshold(100_000, 50, 100)  # a full collection of all that the suite has imported takes seconds
 report_html._DPI = 50  # pictures of reports are drawn in a third of the time
 
 # No deadline: the first example pays for numba's compilation. The same examples each time, so
