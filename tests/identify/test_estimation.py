@@ -1,5 +1,7 @@
 """Estimators on a motion that repeats, recorded with the sensors' noise; coverage in small."""
 
+import functools
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -36,21 +38,23 @@ def repeated():
 @pytest.fixture(scope="module")
 def found(repeated):
     processing = Processing(period=PERIOD)
-    return {m: identify_dynamics(*repeated, processing, Estimator(m)) for m in METHODS}
+    return functools.cache(lambda method: identify_dynamics(*repeated, processing, Estimator(method)))
 
 
+@pytest.mark.daily("least_squares", "weighted")
 @pytest.mark.parametrize("method", METHODS)
 def test_every_estimator_finds_the_recorded_machine_within_its_ellipsoid(found, method):
-    one = found[method]
+    one = found(method)
     distance, limit = one.squared_distance(one.nominal)
     assert limit == pytest.approx(chi2.ppf(0.95, len(one.data_identifiability.base)))
     # one in a thousand right ones lies further away
     assert len(one.data_identifiability.base) > 20 and distance < chi2.ppf(0.999, len(one.data_identifiability.base))
 
 
+@pytest.mark.nightly
 def test_weights_make_the_intervals_narrower(found):
     """In the mean over the parameters that both tell."""
-    plain, others = found["least_squares"], [found[m] for m in METHODS if m != "least_squares"]
+    plain, others = found("least_squares"), [found(m) for m in METHODS if m != "least_squares"]
     for other in others:
         both = set(plain.data_identifiability.base) & set(other.data_identifiability.base)
         stds = [
@@ -62,7 +66,7 @@ def test_weights_make_the_intervals_narrower(found):
 
 @pytest.mark.nightly
 def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated, found):
-    corrected = found["weighted"]
+    corrected = found("weighted")
     kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(noise_pairs=0))
     assert not kept.bias.any()
     where = [corrected.names[b] for b in corrected.data_identifiability.base].index("stribeck.boom_rod")
