@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
@@ -34,6 +35,8 @@ MIN_LOG_BAYES_FACTOR = 20.0
 """Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
 RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
 """Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
+_CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
+_REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distance
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
@@ -162,6 +165,8 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
         now = settled
         evidence.keep(now.judged)
+    tell("compare coloured noise", 0.85)
+    now = compare_colours(evidence, now)
     tell("remove unnecessary effects", 0.87)
     now, rests = remove_needless(evidence, given, now, rounds)
     tell("compare alternative effects", 0.9)
@@ -397,6 +402,47 @@ def colour_noise(evidence: Evidence, now: Model) -> list[Model]:
         return []
     judged = evidence.judged_from(now.guess, levels)
     return [Model(judged, now.fit, now.penalty)] if np.isfinite(judged.loss) else []
+
+
+def compare_colours(evidence: Evidence, now: Model) -> Model:
+    """Find coloured noise again for the final set of effects, now with the same correlation time in all channels, too.
+
+    Slow noise of several sensors is explained by residual inputs as well, and each channel alone then shows too little
+    of it. So all channels get a first-order part at once, and the residual inputs must bring their evidence anew.
+
+    Args:
+        evidence: whose base is the model that is returned afterwards.
+        now: the model. Its coloured noise may have been found before an effect that changes the spectra.
+
+    Returns:
+        The model with other coloured noise if that has more evidence, else the given one.
+    """
+    levels = now.judged.tracks[0].levels
+    total, shares = levels.noise.copy(), np.full(len(levels.noise), np.sqrt(0.5))
+    for colour in levels.colours:
+        total[colour.channel] = np.hypot(total[colour.channel], colour.size)
+    period = max(track.run.period for track in now.judged.tracks)
+
+    def with_noise(white: np.ndarray, colours: tuple[Colour, ...]) -> Model:
+        evidence.set_base(now.judged)
+        start = dataclasses.replace(levels, noise=white, colours=colours, inputs=(), sizes=np.zeros(0))
+        return Model(evidence.judged_from(now.guess, start), now.fit, now.penalty)
+
+    def first_order(rows: float) -> Model:
+        colours = (Colour(c, float(size), rows * period) for c, size in enumerate(shares * total))
+        return with_noise(shares * total, tuple(colours))
+
+    common = {rows: first_order(rows) for rows in _CORRELATION_ROWS}
+    best_rows = min(common, key=lambda rows: common[rows].charged_score)
+    common |= {rows: first_order(rows) for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
+    models = [now, *common.values()]
+    if now.colours:
+        white = with_noise(total, ())
+        evidence.set_base(white.judged)
+        models += [white, *colour_noise(evidence, white)]
+    best = min(models, key=lambda model: model.charged_score)
+    evidence.set_base(best.judged)
+    return now if best is now else settle(evidence, best)
 
 
 def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:

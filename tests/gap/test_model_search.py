@@ -117,6 +117,28 @@ def test_a_machine_with_coloured_sensor_noise_has_no_gap():
         assert found == pytest.approx(stated, rel=0.15)  # 1000 readings with a correlation time of 8 rows
 
 
+@pytest.mark.daily("0.1-0.0")
+@pytest.mark.parametrize(("memory", "frequency"), [(0.1, 0.0), (0.3, 0.0), (0.04, 30.0)])
+def test_an_effect_beside_coloured_noise_of_all_sensors_is_found_with_both(memory, frequency):
+    """Half of the noise variance is coloured; the residual inputs must not stand for the rest."""
+    rig = load_machine("rig")
+    true = rig.axes["slide"].valve.deadband + 0.02
+    noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
+    channels = ("position.slide", "pressure_head.slide", "pressure_rod.slide")
+    truth = rig.replace("axes.slide.valve.deadband", true)
+    data = simulate_data(truth, channels, noise, model=rig, period=0.005, rows=1600, noise_stated=True)
+    colours = {name: Colour(c, float(data.noise[c]), memory, frequency) for c, name in enumerate(channels)}
+    data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
+    gap = find_gap(data, effects=("valve_deadband", "coulomb_friction", "command_delay"), jobs=1, method="regression")
+    assert gap.verdict == "named"
+    assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
+    found = gap.effects[0].parameters["deadband"]
+    assert found.low < true < found.high
+    assert sum("noise variance" in note for note in gap.notes) == 3
+    for size, stated in gap.noise.values():
+        assert size == pytest.approx(stated, rel=0.15)  # 80 independent values of each run
+
+
 @pytest.mark.nightly
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
     """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
