@@ -143,7 +143,8 @@ def write_gap_files(
     """Write the result of a search for model errors: `gap.json`, report, summary and recording.
 
     The corrected machine is written to `patched/` if it differs from the given one, and samples of the
-    changed parameters to `posterior.parquet`. If the search proposes a next experiment, its scenario is written as well.
+    changed parameters to `posterior.parquet`. If the search proposes a next experiment, its scenario is
+    written as well.
 
     Args:
         gap: result of the search.
