@@ -170,7 +170,7 @@ def write_posterior(posterior: Posterior, folder: Path) -> None:
         "kind": POSTERIOR_FOLDER, "machine": posterior.machine.name, "tool": posterior.machine.tool,
         "calibrated": json.dumps(sorted(posterior.calibrated)), "noise": json.dumps(dict(posterior.noise)),
     }  # fmt: skip
-    table = pa.Table.from_arrays([pa.array(column) for column in posterior.samples.T], pa.schema(fields, metadata))
+    table = pa.Table.from_arrays([pa.array(column) for column in posterior.samples.T], schema=pa.schema(fields, metadata))
     with atomic_file(folder / POSTERIOR_FILE, ".parquet") as part:
         pq.write_table(table, part, write_page_checksum=True)
 
