@@ -350,11 +350,15 @@ def _write(
     begin, some = _truncate_run_for_plot(run), slice(0, _MAX_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
     channels = dataset.channels[some]
+    shaded = "; shaded: 95 % band of sampled machines" if any(m.bands for m in comparisons) else ""
     picture = draw_open_loop_predictions(
         time, begin.reading[:, some], {m.name: m.plotted_prediction[:, some] for m in comparisons}, channels,
         [default_channel_unit(channel) for channel in channels],
-        f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s",
-        {m.name: tuple(side[: len(time), some] for side in m.bands[0].plotted) for m in comparisons if m.bands},
+        f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s{shaded}",
+        {
+            m.name: (low[: len(time), some], high[: len(time), some])
+            for m in comparisons for low, high in [bands.plotted for bands in m.bands[:1]]
+        },
     )  # fmt: skip
     (folder / "free_run.png").write_bytes(picture)
     summary = {

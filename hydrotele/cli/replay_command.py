@@ -172,8 +172,10 @@ def compute_replay_band(
 def replay_to_dict(result: Replay, band: ReplayBand | None = None) -> dict:
     """Return a replay as JSON data: log, machine, prediction errors and band of each channel, real-time factor."""
     channels = {n: dataclasses.asdict(c) for n, c in result.channels.items()}
-    for name, b in band.summaries.items() if band else ():
-        channels[name]["band"] = {"width": float(b.width[0]), "inside": float(b.inside[0]), "samples": band.samples}
+    if band:
+        for name, b in band.summaries.items():
+            own = {"width": float(b.width[0]), "inside": float(b.inside[0]), "samples": band.samples}
+            channels[name]["band"] = own
     return {
         "log": result.measured.source,
         "machine": result.simulated.metadata["machine"],
@@ -206,7 +208,9 @@ def _write_replay_files(folder: Path, name: str, machine, result: Replay, band: 
     save_log(result.simulated, folder / f"{name}_simulated.parquet")
     run = result.measured.metadata.get("run", name)
     title = f"{machine.name}, {run}: measured and replayed"
-    limits = band.limits if band else None
+    limits = None
+    if band:
+        limits, title = band.limits, f"{title}; shaded: 95 % band of {band.samples} sampled machines"
     plot_overlay(result.measured, result.simulated, folder / f"{name}.png", title=title, band=limits)
     entries = {
         "measured": (machine, result.measured.without_truth()),

@@ -89,7 +89,7 @@ def sample_posterior(
                 parts.append((_select(hypothesis, own), deviation[own]))
                 chosen += [first + k for k in own]
             first += len(names)
-    covariance = block_diag(*(c for _, c in fits))[np.ix_(chosen, chosen)] if chosen else np.zeros((0, 0))
+    covariance = np.asarray(block_diag(*(c for _, c in fits)))[np.ix_(chosen, chosen)]
     if not chosen or not np.isfinite(covariance).all():
         return None
     fitted = Guess(tuple(parts))
@@ -170,7 +170,9 @@ def write_posterior(posterior: Posterior, folder: Path) -> None:
         "kind": POSTERIOR_FOLDER, "machine": posterior.machine.name, "tool": posterior.machine.tool,
         "calibrated": json.dumps(sorted(posterior.calibrated)), "noise": json.dumps(dict(posterior.noise)),
     }  # fmt: skip
-    table = pa.Table.from_arrays([pa.array(column) for column in posterior.samples.T], schema=pa.schema(fields, metadata))
+    table = pa.Table.from_arrays(
+        [pa.array(column) for column in posterior.samples.T], schema=pa.schema(fields, metadata)
+    )
     with atomic_file(folder / POSTERIOR_FILE, ".parquet") as part:
         pq.write_table(table, part, write_page_checksum=True)
 

@@ -256,7 +256,7 @@ def draw_open_loop_predictions(
             for k, (name, values) in enumerate(predicted.items()):
                 plot.plot(time, factor * values[:, c], color=_COLOURS[k % len(_COLOURS)], lw=0.9,
                           ls="-" if k < len(_COLOURS) else "--", label=name)  # fmt: skip
-                if name in (bands or {}):
+                if bands and name in bands:
                     low_limit, high_limit = (factor * side[:, c] for side in bands[name])
                     plot.fill_between(time, low_limit, high_limit, color=_COLOURS[k % len(_COLOURS)], lw=0.0,
                                       alpha=_BAND_OPACITY)  # fmt: skip

@@ -13,7 +13,7 @@ from hydrotele.envs.task import Options
 from hydrotele.envs.task_catalogue import TASKS
 from hydrotele.envs.variants import make_variants
 from hydrotele.estimate.evidence import draw_truncated_normal
-from hydrotele.estimate.hypothesis import Guess, calibration, hypotheses
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, calibration, hypotheses
 from hydrotele.gap.bands import prediction_band
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.patched import write_patch
@@ -118,6 +118,15 @@ def test_effects_and_calibrated_parameters_keep_their_correlations_and_survive_a
     assert read.names == posterior.names and read.units == posterior.units
     deviation = (posterior.samples[2] - np.array([p.nominal for p in parameters])) / [p.prior_std for p in parameters]
     assert machine_of_sample(read, 2).links == guess.at(deviation).machine(rig).links
+
+
+def test_learned_laws_are_in_the_machine_that_the_samples_change():
+    rig = load_machine("rig")
+    (effect,) = hypotheses(rig, ["valve_deadband"])
+    law = Hypothesis("learned_force", "slide", {}, lambda machine, _: machine.replace("axes.slide.valve.damping", 0.5))
+    guess = Guess(((effect, np.ones(1)), (law, np.zeros(0))))
+    posterior = sample_posterior(rig, [(guess, 0.01 * np.eye(1))], {}, 5)
+    assert posterior.names == (DEADBAND,) and machine_of_sample(posterior, 3).axes["slide"].valve.damping == 0.5
 
 
 def test_a_later_fit_replaces_an_earlier_one_of_the_same_parameter():
