@@ -1,7 +1,7 @@
 """Prediction bands: open-loop predictions of machines sampled from the posterior of a gap search.
 
 A band holds the uncertainty of the sampled parameters and, where stated, measurement noise. It does not hold
-laws that are missing in the model, nor the uncertainty of parameters that the search did not change.
+laws that are missing in the model, parameters that the search did not change, or errors of the start states.
 """
 
 import math
