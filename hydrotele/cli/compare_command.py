@@ -6,7 +6,8 @@ channel at each horizon, as a table, as JSON and as a plot.
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
-from hydrotele.cli.input_logs import load_machine_for_logs
+from hydrotele.cli.input_logs import find_corrected_machine_folder, load_machine_for_logs
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
@@ -37,19 +38,18 @@ from hydrotele.estimate.free_run import (
     machine_runner,
 )
 from hydrotele.estimate.reduced_model import predicted_channels
+from hydrotele.gap.bands import BandSummary, RunBands, band_document, compute_run_bands, noise_of, sample_machines
+from hydrotele.gap.posterior import POSTERIOR_FILE, Posterior, read_posterior
 from hydrotele.hydraulics.actuator_layout import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.machine_file import MACHINE_FILE
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 
-_MACHINE_SUBFOLDERS = (
-    "patched",
-    "identified",
-)  # subfolders in which `gap` and `identify` write the machine
 _MAX_PLOT_SECONDS, _MAX_PLOTS = 120.0, 12  # duration [s] and number of channels in the plot
 _ONE_STEP = "one row"
+DEFAULT_BANDS = 20  # sampled machines per model with a posterior
+_THREADS = 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +63,8 @@ class ModelComparison:
         plotted_prediction: (n, c) open-loop predictions of n rows and c channels of the first run.
         lost: one sentence per run on which the one-step predictions of the model diverge, although
             the measurements correct them at every row.
+        bands: prediction bands of the sampled machines, one item per run; empty without a posterior.
+        samples: number of sampled machines.
     """
 
     name: str
@@ -70,6 +72,19 @@ class ModelComparison:
     runs: tuple[RunErrors, ...]
     plotted_prediction: np.ndarray
     lost: tuple[str, ...] = ()
+    bands: tuple[RunBands, ...] = ()
+    samples: int = 0
+
+    def mean_band(self, horizon: str) -> BandSummary | None:
+        """Return the prediction band at a horizon, averaged over the runs; None without one."""
+        found = [bands.horizons[horizon] for bands in self.bands if horizon in bands.horizons]
+        if not found:
+            return None
+        widths, fractions = (np.array([getattr(b, name) for b in found]) for name in ("width", "inside"))
+        known = np.isfinite(fractions)
+        mean = np.where(known, fractions, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        inside = np.where(known.any(axis=0), mean, math.nan)
+        return BandSummary(widths.mean(axis=0), inside, sum(b.diverged for b in found))
 
     def mean_errors(self, horizon: str) -> np.ndarray:
         """Return the RMS prediction errors of the c channels at a horizon, averaged over the runs.
@@ -96,7 +111,7 @@ class ModelComparison:
 def compare_models(
     machines: Sequence[str], data: Sequence[Path], tool: str | None, heldout: str | None,
     sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], include_fitted: bool,
-    target: Path | None, as_json: bool, force: bool = False,
+    target: Path | None, as_json: bool, force: bool = False, bands: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Compare open-loop predictions of several models on runs that were not used to fit them.
 
@@ -113,6 +128,8 @@ def compare_models(
         target: folder for compare.json and the plot, None to write nothing.
         as_json: print JSON instead of tables.
         force: accept logs whose metadata name another machine or tool.
+        bands: number of machines sampled from the posterior of each result folder of `gap`, for prediction
+            bands; 0 for none, None for 20 where a folder has a posterior.
 
     Returns:
         The result in the form of `compare.json`.
@@ -132,10 +149,11 @@ def compare_models(
     )  # fmt: skip
     for name, machine in named.items():
         _check_same_channels(name, machine, dataset)
+    posteriors = _read_posteriors(machines, bands)
     judged = [*dataset.fit, dataset.heldout] if include_fitted else [dataset.heldout]
     _check_horizons(horizons, judged)
     with show_stages("compare", as_json) as progress:
-        compared = _evaluate_models(named, baselines, dataset, judged, horizons, progress)
+        compared = _evaluate_models(named, baselines, dataset, judged, horizons, progress, posteriors, bands)
     shown = _available_horizons(compared)
     document = build_comparison_document(compared, shown, dataset, data)
     if target is not None:
@@ -150,15 +168,19 @@ def compare_models(
     return document
 
 
-def find_corrected_machine_folder(name: str) -> str:
-    """Return the subfolder with the corrected machine of a result folder of `gap` or `identify`.
+def _read_posteriors(names: Sequence[str], bands: int | None) -> dict[str, Posterior]:
+    """Return model name -> posterior of the models that have one; none with 0 bands.
 
-    Any other name or folder is returned unchanged.
+    Raises:
+        InputError: bands are requested, but no model has a posterior, or a posterior is damaged.
     """
-    for inside in _MACHINE_SUBFOLDERS:
-        if (Path(name) / inside / MACHINE_FILE).is_file():
-            return str(Path(name) / inside)
-    return name
+    if bands == 0:
+        return {}
+    found = {name: read_posterior(name) for name in names if (Path(name) / POSTERIOR_FILE).is_file()}
+    if bands and not found:
+        message = f"needs a result folder of `hydrotele gap` that contains {POSTERIOR_FILE} among the models"
+        raise InputError(f"--bands {bands}", message)
+    return found
 
 
 def build_comparison_document(
@@ -181,6 +203,7 @@ def build_comparison_document(
 
     models = []
     for model in comparisons:
+        bands = [run.horizons for run in model.bands] or [{}] * len(model.runs)
         runs = [
             {
                 "run": errors.run,
@@ -190,18 +213,21 @@ def build_comparison_document(
                         "seconds": h.seconds, "windows": h.windows, "diverged": h.diverged,
                         "rms": map_channels_to_values(h.rms), "final": map_channels_to_values(h.final),
                         "median": map_channels_to_values(h.median),
+                        **({"band": band_document(own[name], dataset.channels)} if name in own else {}),
                     }
                     for name, h in errors.horizons.items()
                 },
             }
-            for errors in model.runs
+            for errors, own in zip(model.runs, bands, strict=True)
         ]  # fmt: skip
         mean = {name: map_channels_to_values(model.mean_errors(name)) for name in printed_horizons}
         one_step = map_channels_to_values(model.mean_errors(_ONE_STEP))
-        models.append(
-            {"name": model.name, "kind": model.kind, "runs": runs,
-             "mean": {"one_step": one_step, "horizons": mean}}
-        )  # fmt: skip
+        means: dict[str, Any] = {"one_step": one_step, "horizons": mean}
+        if model.bands:
+            found = {name: model.mean_band(name) for name in printed_horizons}
+            means["bands"] = {name: band_document(b, dataset.channels) for name, b in found.items() if b}
+        samples = {"samples": model.samples} if model.bands else {}
+        models.append({"name": model.name, "kind": model.kind, **samples, "runs": runs, "mean": means})
     return to_json_types(
         {
             "machine": dataset.machine.name,
@@ -216,12 +242,18 @@ def build_comparison_document(
 
 
 def _list_notes(dataset: Dataset, comparisons: Sequence[ModelComparison]) -> list[str]:
-    return [*dataset.notes, *(note for model in comparisons for note in model.lost)]
+    diverged = {m.name: sum(b.diverged for run in m.bands for b in run.horizons.values()) for m in comparisons}
+    return [
+        *dataset.notes, *(note for model in comparisons for note in model.lost),
+        *(f"{name}: {count} predictions of sampled machines diverged; the bands do not contain them"
+          for name, count in diverged.items() if count),
+    ]  # fmt: skip
 
 
 def _evaluate_models(
     machines: dict[str, Machine], baselines: Sequence[str], dataset: Dataset,
     evaluated_runs: Sequence[RunData], horizons: Sequence[float], progress: Callable | None,
+    posteriors: Mapping[str, Posterior], samples: int | None,
 ) -> list[ModelComparison]:  # fmt: skip
     say = progress or (lambda said, share: None)
     total = (len(machines) + len(baselines)) * (len(evaluated_runs) + 1)
@@ -233,7 +265,10 @@ def _evaluate_models(
     compared, done = [], 0
     for name, kind, make in models:
         say(name, done / total)
-        prepare, errors, lost, pictured = make(), [], [], np.empty(0)
+        prepare, errors, lost, pictured, bands = make(), [], [], np.empty(0), []
+        sampled = []
+        if posterior := posteriors.get(name):
+            sampled = sample_machines(posterior, samples or min(DEFAULT_BANDS, len(posterior.samples)))
         for run in evaluated_runs:
             done += 1
             say(f"{name} on {run.name}", done / total)
@@ -244,8 +279,13 @@ def _evaluate_models(
             if run is evaluated_runs[0]:
                 begin = _truncate_run_for_plot(run)
                 pictured = chained(runner, begin, _choose_plot_horizon(horizons, run))
+            if sampled:
+                say(f"{len(sampled)} machines sampled from {name} on {run.name}", done / total)
+                noise, restart = noise_of(posteriors[name], dataset), _choose_plot_horizon(horizons, run)
+                with ThreadPoolExecutor(_THREADS) as pool:
+                    bands.append(compute_run_bands(sampled, dataset, run, noise, horizons, restart, pool.map))
         done += 1
-        compared.append(ModelComparison(name, kind, tuple(errors), pictured, tuple(lost)))
+        compared.append(ModelComparison(name, kind, tuple(errors), pictured, tuple(lost), tuple(bands), len(sampled)))
     return compared
 
 
@@ -310,10 +350,15 @@ def _write(
     begin, some = _truncate_run_for_plot(run), slice(0, _MAX_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
     channels = dataset.channels[some]
+    shaded = "; shaded: 95 % band of sampled machines" if any(m.bands for m in comparisons) else ""
     picture = draw_open_loop_predictions(
         time, begin.reading[:, some], {m.name: m.plotted_prediction[:, some] for m in comparisons}, channels,
         [default_channel_unit(channel) for channel in channels],
-        f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s",
+        f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s{shaded}",
+        {
+            m.name: (low[: len(time), some], high[: len(time), some])
+            for m in comparisons for low, high in [bands.plotted for bands in m.bands[:1]]
+        },
     )  # fmt: skip
     (folder / "free_run.png").write_bytes(picture)
     summary = {
@@ -354,12 +399,36 @@ def _print(
                 end_section=horizon == printed_horizons[-1],
             )
     stdout_console.print(rows)
+    for model in comparisons:
+        if model.bands:
+            stdout_console.print(_make_band_table(model, printed_horizons, dataset.channels))
     fitted = [m.name for m in comparisons if m.kind == "baseline"]
     if fitted:
         trained = ", ".join(run.name for run in dataset.fit)
         stdout_console.print(f"{', '.join(fitted)}: fitted on {trained}")
     for note in _list_notes(dataset, comparisons):
         stdout_console.print(f"[yellow]note[/] {note}")
+
+
+def _make_band_table(model: ModelComparison, horizons: Sequence[str], channels: Sequence[str]) -> Any:
+    """Return the table of the prediction bands of a model."""
+    title = (
+        f"{model.name}: 95 % prediction bands of {model.samples} machines sampled from the posterior (parameter"
+        " uncertainty and measurement noise, no missing laws)"
+    )
+    rows = make_table(title, "channel", "horizon", "band width, RMS", "unit", "measured inside band with noise")
+    found = {h: band for h in horizons if (band := model.mean_band(h))}
+    for c, channel in enumerate(channels):
+        unit, factor = display_unit(
+            default_channel_unit(channel), max((b.width[c] for b in found.values()), default=math.nan)
+        )
+        for number, (horizon, band) in enumerate(found.items()):
+            inside = f"{100 * band.inside[c]:.1f} %" if math.isfinite(band.inside[c]) else "-"
+            rows.add_row(
+                "" if number else channel, _format_horizon(horizon), f"{band.width[c] * factor:.3g}", unit, inside,
+                end_section=number == len(found) - 1,
+            )  # fmt: skip
+    return rows
 
 
 def _format_horizon(horizon: str) -> str:

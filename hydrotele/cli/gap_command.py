@@ -34,6 +34,7 @@ from hydrotele.effects import EFFECTS
 from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.interim import Interim
 from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
+from hydrotele.gap.posterior import write_posterior
 from hydrotele.gap.result import Gap, Method, finite, gap_document, in_customary_units
 from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
@@ -141,8 +142,9 @@ def write_gap_files(
 ) -> None:
     """Write the result of a search for model errors: `gap.json`, report, summary and recording.
 
-    The corrected machine is written to `patched/` if it differs from the given one. If the search
-    proposes a next experiment, its scenario is written as well.
+    The corrected machine is written to `patched/` if it differs from the given one, and samples of the
+    changed parameters to `posterior.parquet`. If the search proposes a next experiment, its scenario is
+    written as well.
 
     Args:
         gap: result of the search.
@@ -159,6 +161,8 @@ def write_gap_files(
         patched.mkdir()
         write_patch(gap, patched)
         build_plant(gap.patched).document.save(patched / "machine.xml")
+    if gap.posterior:
+        write_posterior(gap.posterior, folder)
     if scenario := (gap.next_experiment or {}).get("scenario"):
         text = yaml.safe_dump(finite(scenario), sort_keys=False)
         (folder / "next_experiment.yaml").write_text(text, encoding="utf-8")

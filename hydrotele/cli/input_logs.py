@@ -17,6 +17,19 @@ from hydrotele.logs.table import read_metadata
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine
 
+_MACHINE_SUBFOLDERS = ("patched", "identified")  # subfolders in which `gap` and `identify` write the machine
+
+
+def find_corrected_machine_folder(name: str) -> str:
+    """Return the subfolder with the corrected machine of a result folder of `gap` or `identify`.
+
+    Any other name or folder is returned unchanged.
+    """
+    for inside in _MACHINE_SUBFOLDERS:
+        if (Path(name) / inside / MACHINE_FILE).is_file():
+            return str(Path(name) / inside)
+    return name
+
 
 class OpenedLogs(NamedTuple):
     """Logs that were accepted for a machine.

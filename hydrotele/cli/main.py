@@ -39,6 +39,8 @@ def _load_effect_files(files: list[Path] | None) -> list[Path] | None:
     return files
 
 
+MAX_BANDS = 200  # samples in posterior.parquet
+
 EffectFilesOption = Annotated[
     list[Path] | None,
     typer.Option(
@@ -60,6 +62,10 @@ Each model predicts a held-out run, which was not used to fit it. The prediction
 of the log, from the state estimated there. It then uses only the commands (open-loop prediction)
 and is compared with the measurements. The one-step error, from one row to the next, is listed as
 well. Horizons longer than the run are omitted.
+
+\b
+A result folder of gap with posterior.parquet also gets a 95 % prediction band, from machines sampled
+from the posterior. The band holds parameter uncertainty and measurement noise, not missing laws.
 
 \b
 Black-box models, fitted on the other runs (--baseline, repeatable):
@@ -86,6 +92,16 @@ def compare(
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="Evaluate the models on the fitted runs as well.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a plot.")] = None,
+    bands: Annotated[
+        int | None,
+        typer.Option(
+            "--bands",
+            min=0,
+            max=MAX_BANDS,
+            help="Machines sampled per result folder of gap, for prediction bands; default: 20 with a posterior.",
+        ),
+    ] = None,
+    effects: EffectFilesOption = None,
     force: Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
@@ -94,7 +110,7 @@ def compare(
 
     compare_models(
         machine, data, tool, heldout, sensors, parse_positive_numbers("--horizons", horizons), baseline or [],
-        every, out, json, force,
+        every, out, json, force, bands,
     )  # fmt: skip
 
 
@@ -280,6 +296,16 @@ def replay(
             help="Folder for plots and recordings; default: runs/replay_LOG, none with --json.",
         ),
     ] = None,
+    bands: Annotated[
+        int,
+        typer.Option(
+            "--bands",
+            min=0,
+            max=MAX_BANDS,
+            help="Machines sampled from the posterior, if --machine is a result folder of gap. The 95 % band holds"
+            " parameter uncertainty and measurement noise, not missing laws.",
+        ),
+    ] = 0,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
     force: ForceOption = False,
@@ -287,7 +313,7 @@ def replay(
     """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.replay_command import replay_logs
 
-    replay_logs(logs, machine, tool, timestep, out, json, force)
+    replay_logs(logs, machine, tool, timestep, out, json, force, bands)
 
 
 @app.command(

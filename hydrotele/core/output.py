@@ -24,6 +24,7 @@ OUTPUT_FILES = {
     "gap": (
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
         "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
+        "posterior.parquet", "posterior/machine.*", "posterior/machine_assets/*",
     ),
     "interim gap": ("interim.json", "machine.*", "machine_assets/*"),
     "compare": ("compare.json", "*.png"),

@@ -7,6 +7,7 @@ whether it stays in the workspace.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import mujoco
@@ -91,7 +92,8 @@ class Options:
             nearest to 200 Hz, or at this rate if it is higher.
         duration: duration of an episode [s].
         effects: effects added to every episode: mappings with `name`, `location`, `parameters`.
-        randomise: effects with a range [low, high] per parameter, drawn for every variant.
+        randomise: effects with a range [low, high] per parameter, drawn for every variant; or the result folder
+            of `hydrotele gap`, of whose posterior every variant is one sample; or a list of both.
         variants: number of random machines and starts; every episode uses one of them.
         variant_seed: seed for drawing the variants.
         timestep: physics step [s].
@@ -102,7 +104,7 @@ class Options:
     control_rate: float = 50.0
     duration: float | None = None
     effects: tuple[dict[str, Any], ...] = ()
-    randomise: tuple[dict[str, Any], ...] = ()
+    randomise: tuple[dict[str, Any] | str | Path, ...] | str | Path = ()
     variants: int = 64
     variant_seed: int = 0
     timestep: float = 1.0e-3

@@ -6,7 +6,8 @@ episode selects a variant by copying model parameters and a state in native code
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -14,9 +15,11 @@ import numpy as np
 from mujoco.batch import MODEL_FIELDS
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.envs.episode import MAX_AXES, MAX_CHANNELS
 from hydrotele.envs.task import Options, Task
+from hydrotele.gap.posterior import Posterior, machine_of_sample, read_posterior
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.scenario.surrounding_objects import SurroundingObject
@@ -75,25 +78,57 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
         The variants.
 
     Raises:
-        InputError: an effect is not valid for the machine, or a randomised effect changes the
-            structure of the model.
+        InputError: an effect is not valid for the machine, a randomised effect changes the
+            structure of the model, or a posterior is missing, damaged or of another machine.
     """
-    key = repr((task.name, options.effects, options.randomise, options.variants,
+    ranges, folder = split_randomise(options)
+    written = folder and [file.stat().st_mtime_ns for file in sorted(folder.glob("posterior*")) if file.is_file()]
+    key = repr((task.name, options.effects, ranges, folder and resolve_path(folder), written, options.variants,
                 options.variant_seed, options.timestep))  # fmt: skip
     if key not in _CACHE:
-        _CACHE[key] = _build_variants(task, options, nominal)
+        _CACHE[key] = _build_variants(task, options, nominal, ranges, _read_posterior(folder, nominal))
         while len(_CACHE) > _MAX_CACHED_SETS:
             _CACHE.pop(next(iter(_CACHE)))
     return _CACHE[key]
 
 
-def _build_variants(task: Task, options: Options, nominal: Machine) -> Variants:
+def split_randomise(options: Options) -> tuple[tuple[Mapping[str, Any], ...], Path | None]:
+    """Return the effects with ranges of `Options.randomise`, and its result folder of `hydrotele gap` or None.
+
+    Raises:
+        InputError: there are several folders.
+    """
+    given = options.randomise
+    entries = (given,) if isinstance(given, str | Path) else given
+    folders = [Path(entry) for entry in entries if isinstance(entry, str | Path)]
+    if len(folders) > 1:
+        raise InputError("randomise", "takes one result folder of `hydrotele gap`, not several")
+    return tuple(entry for entry in entries if not isinstance(entry, str | Path)), folders[0] if folders else None
+
+
+def _read_posterior(folder: Path | None, nominal: Machine) -> Posterior | None:
+    """Read the posterior of a result folder and check that it is of the task's machine and tool."""
+    if folder is None:
+        return None
+    posterior = read_posterior(folder)
+    own = posterior.machine
+    if (own.name, own.tool, set(own.axes)) != (nominal.name, nominal.tool, set(nominal.axes)):
+        message = f"is the result for {own.name} with the tool {own.tool}; the task needs {nominal.name} with"
+        raise InputError(f"randomise {folder}", f"{message} {nominal.tool} and the same axes")
+    return posterior
+
+
+def _build_variants(
+    task: Task, options: Options, nominal: Machine, ranges: Sequence[Mapping[str, Any]], posterior: Posterior | None
+) -> Variants:
     machines, plants, states, tips = [], [], [], []
+    order = np.random.default_rng(options.variant_seed).permutation(len(posterior.samples)) if posterior else []
     for number in range(options.variants):
         rng = np.random.default_rng([options.variant_seed, number])
         joints = task.start(nominal, rng)
         things = task.surroundings(nominal, rng, joints)
-        machine = _apply_effects(nominal, options, rng)
+        machine = machine_of_sample(posterior, order[number % len(order)]) if posterior else nominal
+        machine = _apply_effects(machine, options.effects, ranges, rng)
         known = (p for m, p in zip(machines, plants, strict=True)
                  if m == machine and p.surroundings == things)  # fmt: skip
         plant = next(known, None)
@@ -119,15 +154,14 @@ def _rename_axes_to_joints(machine: Machine, places: Mapping[str, float]) -> dic
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
 
-def _apply_effects(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
-    """Return the machine with the effects of the options added.
-
-    Effects in `randomise` get parameters drawn uniformly from their ranges.
-    """
-    machine = nominal
-    for effect in options.effects:
+def _apply_effects(
+    machine: Machine, effects: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, Any]],
+    rng: np.random.Generator,
+) -> Machine:  # fmt: skip
+    """Return the machine with effects added; those with ranges get parameters drawn uniformly from them."""
+    for effect in effects:
         machine = apply_effect(machine, *_parse_effect(effect), dict(effect.get("parameters", {})))
-    for effect in options.randomise:
+    for effect in ranges:
         drawn = {
             key: float(rng.uniform(*_parse_range(effect, key, value)))
             for key, value in effect.get("parameters", {}).items()

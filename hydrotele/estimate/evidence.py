@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
+from scipy.special import ndtr, ndtri
 
 from hydrotele.estimate.filter import MEMORY
 from hydrotele.estimate.hypothesis import DomainError, Guess
@@ -505,8 +506,8 @@ _MOST = 0.8  # of the dents seen are no deeper; where a filter loses its machine
 _FARTHEST = 256.0  # standard deviations to which dents are followed
 
 
-def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
-    """Standard deviations of a guess's numbers.
+def posterior_covariance(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
+    """Return the covariance of a fitted guess's parameters (Laplace), widened by what its curvature leaves out.
 
     Where errors hang together over time, as those of a law of another form do, stretches of the
     runs pull at the numbers more unlike than independent noise would, and the spread follows their
@@ -516,13 +517,16 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
     of a uniform error, for neither step is the truth (Guide to the expression of uncertainty in
     measurement, 4.3.7). A likelihood with dents widens them to the dents' reach.
 
+    Noise and scatter keep the correlations of the inverse information. The change by the step moves all
+    parameters together.
+
     Args:
         evidence: with the guess as its base.
         guess: fitted.
         scatter: chi-square per degree of freedom of the sizes that the runs ask for.
 
     Returns:
-        (P,) standard deviations, in typical deviations.
+        (P, P) covariance of the normalised deviations.
     """
     step = evidence.step_of(guess, evidence.step)
     few = len(guess.deviation) <= _FEW
@@ -532,11 +536,70 @@ def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) 
         slopes = evidence.base_slopes(evidence.slope_step)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     covariance = invert_information(information)
-    noisy = np.maximum(np.diag(covariance), _sandwich(evidence, slopes, covariance))
+    plain = np.diag(covariance)
+    widening = np.sqrt(np.maximum(plain, _sandwich(evidence, slopes, covariance)) / plain)
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
-    spread = np.sqrt(widened * noisy + shift**2 / 3.0)
-    return spread * _beyond_dents(evidence, guess, 1.0 / np.sqrt(np.diag(information)))
+    whole = widened * covariance * np.outer(widening, widening) + np.outer(shift, shift) / 3.0
+    factors = _beyond_dents(evidence, guess, 1.0 / np.sqrt(np.diag(information)))
+    return whole * np.outer(factors, factors)
+
+
+def standard_deviations(evidence: Evidence, guess: Guess, scatter: float = 1.0) -> np.ndarray:
+    """Return the standard deviations (P,) of a fitted guess's parameters, in normalised deviations.
+
+    They are the square roots of the diagonal of `posterior_covariance`, which has the same arguments.
+    """
+    return np.sqrt(np.diag(posterior_covariance(evidence, guess, scatter)))
+
+
+_SEED = 0
+_BATCH, _MAX_BATCHES = 1000, 100  # normal samples that are drawn at once, and how often
+_SWEEPS = 20  # of the Gibbs sampler between two samples
+_MAX_CHECKS = 10  # points of the Gibbs sampler per sample that are tested for the domain
+
+
+def draw_truncated_normal(
+    mean: np.ndarray, covariance: np.ndarray, bounds: tuple[np.ndarray, np.ndarray],
+    is_valid: Callable[[np.ndarray], bool], count: int,
+) -> np.ndarray:  # fmt: skip
+    """Draw samples of a normal distribution inside bounds and a domain, with a fixed seed.
+
+    A sample outside is drawn again. If fewer than `count` of 100 000 samples are inside, as with many estimates
+    at their bounds, a Gibbs sampler draws parameter by parameter (Geweke 1991, section 3).
+
+    Args:
+        mean: (P,) inside the bounds.
+        covariance: (P, P) positive definite.
+        bounds: lower (P,) and upper (P,).
+        is_valid: function (P,) -> whether a point inside the bounds belongs to the domain.
+        count: number of samples.
+
+    Returns:
+        (n, P) samples; n is smaller than `count` only if nearly all points are outside the domain.
+    """
+    rng, root, (low, high) = np.random.default_rng(_SEED), factor_information(covariance), bounds
+    found: list[np.ndarray] = []
+    for _ in range(_MAX_BATCHES):
+        drawn = mean + rng.standard_normal((_BATCH, len(mean))) @ root.T
+        inside = drawn[np.all((drawn >= low) & (drawn <= high), axis=1)]
+        found += [point for point in inside[: count - len(found)] if is_valid(point)]
+        if len(found) == count:
+            return np.array(found)
+    inverse = np.linalg.inv(root)
+    information = inverse.T @ inverse
+    sd = 1.0 / np.sqrt(np.diag(information))
+    found, point = [], np.clip(mean, low, high)
+    for sweep in range(1, _MAX_CHECKS * _SWEEPS * count):
+        for k in range(len(mean)):
+            middle = point[k] - sd[k] ** 2 * (information[k] @ (point - mean))
+            below, above = ndtr((np.array([low[k], high[k]]) - middle) / sd[k])
+            point[k] = np.clip(middle + sd[k] * ndtri(below + (above - below) * rng.uniform()), low[k], high[k])
+        if sweep % _SWEEPS == 0 and is_valid(point):
+            found.append(point.copy())
+            if len(found) == count:
+                break
+    return np.array(found)
 
 
 def _beyond_dents(evidence: Evidence, guess: Guess, alone: np.ndarray) -> np.ndarray:

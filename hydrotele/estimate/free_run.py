@@ -176,18 +176,19 @@ def machine_runner(machine: Machine, data: Dataset, step: float = STEP) -> Prepa
 
     def prepare(run: RunData) -> Runner:
         track = track_run(machine, data, run, step=step, levels=levels)
+        states = track.states  # what the prediction keeps: gains and Jacobians of a track are larger
         steps = steps_per_row(machine, run.period, step)
         late = np.any(model.lag > 0.0) or np.any(model.time_constant > 0.0)
-        before = _shown(model, track.states, run.period) if late else None
+        before = _shown(model, states, run.period) if late else None
 
         def free(starts: np.ndarray, count: int) -> np.ndarray:
             out = np.full((len(starts), count, len(data.channels)), np.nan)
             for made, row in zip(out, starts, strict=True):
-                if np.isfinite(track.states[row]).all():
+                if np.isfinite(states[row]).all():
                     past = np.zeros((1, len(model.lag))) if before is None else before
                     space = model_space(model)
                     space.time[1] = run.start
-                    _run_from(model, space, track.states[row].copy(), run.command, int(row),
+                    _run_from(model, space, states[row].copy(), run.command, int(row),
                               run.period, steps, past, made)  # fmt: skip
             return out
 
@@ -225,7 +226,7 @@ def free_run_errors(
     left = len(run.reading) - 1 - first
     if to_end and left > 0:
         found[TO_THE_END] = _judge(runner, run, np.array([first]), left)
-    gone = _left(runner.one_step, run.reading)
+    gone = find_diverged_rows(runner.one_step, run.reading)
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.where(gone, np.inf, runner.one_step - run.reading)
     return RunErrors(run.name, _rms(np.where(np.isnan(run.reading), np.nan, error)[first:]), found)
@@ -247,7 +248,7 @@ def chained(runner: Runner, run: RunData, seconds: float) -> np.ndarray:
     for start in range(round(SETTLE / run.period), rows - 1, count):
         ahead = min(count, rows - 1 - start)
         predicted[start + 1 : start + 1 + ahead] = runner.run(np.array([start]), ahead)[0]
-    return np.where(_left(predicted, run.reading), np.nan, predicted)
+    return np.where(find_diverged_rows(predicted, run.reading), np.nan, predicted)
 
 
 def window_starts(rows: int, period: float, seconds: float) -> np.ndarray:
@@ -287,7 +288,7 @@ def _judge(runner: Runner, run: RunData, starts: np.ndarray, count: int) -> Hori
     """Errors of the windows of one length."""
     predicted = runner.run(starts, count)
     measured = run.reading[starts[:, None] + np.arange(1, count + 1)]
-    gone = np.any(_left(predicted, run.reading), axis=(1, 2))
+    gone = np.any(find_diverged_rows(predicted, run.reading), axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.where(gone[:, None, None], np.inf, predicted - measured)
     error = np.where(np.isnan(measured), np.nan, error)
@@ -299,7 +300,7 @@ def _judge(runner: Runner, run: RunData, starts: np.ndarray, count: int) -> Hori
     )  # fmt: skip
 
 
-def _left(predicted: np.ndarray, reading: np.ndarray) -> np.ndarray:
+def find_diverged_rows(predicted: np.ndarray, reading: np.ndarray) -> np.ndarray:
     """(..., c) where a prediction is no number, or far outside of all that was ever read."""
     low = np.min(reading, axis=0, initial=np.inf, where=np.isfinite(reading))
     high = np.max(reading, axis=0, initial=-np.inf, where=np.isfinite(reading))

@@ -62,12 +62,16 @@ class FreeCalibration:
             travel beyond the dead band; ratios to the given machine where no unit fits.
         note: one sentence on what stretches that were left out say.
         seconds: length of the free runs [s].
+        guess: the fitted parameters, as changes of the given machine.
+        covariance: (P, P) of their normalised deviations.
     """
 
     machine: Machine
     numbers: dict[str, Estimate]
     note: str
     seconds: float
+    guess: Guess
+    covariance: np.ndarray
 
     def undone_by(self, data: Dataset, machine: Machine, jobs: int) -> bool:
         """Whether another machine predicts free runs of the held-out run worse than this one.
@@ -118,7 +122,8 @@ def calibrate_freely(
         "The open parameters of the machine file were calibrated on open-loop predictions first."
         f" In cross-validation over intervals of {seconds:g} s, the errors decrease by: {closer}."
     )
-    return FreeCalibration(_told(data.machine, fit), _numbers(data.machine, fit), note, seconds)
+    numbers = _numbers(data.machine, fit)
+    return FreeCalibration(_told(data.machine, fit), numbers, note, seconds, fit.guess, fit.covariance)
 
 
 def _seconds(run: RunData) -> float:

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from hydrotele.effects import locate_error_in_effect_file
 from hydrotele.effects.effect import with_value
 from hydrotele.estimate.colour import Colour
-from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
+from hydrotele.estimate.evidence import Evidence, Judged, posterior_covariance
 from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import rippled, stated_jitter
@@ -29,6 +29,7 @@ from hydrotele.gap.explanation import compare_contenders, list_rejections, trace
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
+from hydrotele.gap.posterior import Posterior, sample_posterior
 from hydrotele.gap.profiles import find_profiles, profile_words
 from hydrotele.gap.residuals import (
     believed,
@@ -189,7 +190,8 @@ def find_gap(
         told = found.judged if discovery.laws else discovery.judged
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
-        spread = standard_deviations(evidence, told.guess, scatter)
+        covariance = posterior_covariance(evidence, told.guess, scatter)
+        spread = np.sqrt(np.diag(covariance))
         method_notes = []
         if method == "regression":
             method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
@@ -223,6 +225,9 @@ def find_gap(
     jitter = _jitter(data, judge.levels)
     if jitter[0] != jitter[1] and data.sensors:
         patched = with_value(patched, f"sensors.{data.sensors}.jitter", jitter[0])
+    posterior = None
+    if named or calibration or opened:
+        posterior = _sample_posterior(data, given, opened, (discovery.judged.guess, covariance), judge.levels)
     return Gap(
         machine=given,
         patched=patched,
@@ -261,6 +266,7 @@ def find_gap(
             ),
             traces,
         ),
+        posterior=posterior,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
@@ -659,6 +665,20 @@ def _all_calibrated(
     first = {key: dataclasses.replace(e, nominal=freely[key].nominal) for key, e in later.items()
              if key in freely}  # fmt: skip
     return {k: e for k, e in (later | freely | first).items() if k not in gone}
+
+
+def _sample_posterior(
+    data: Dataset, given: Machine, opened: FreeCalibration | None, fit: tuple[Guess, np.ndarray], levels: Levels
+) -> Posterior | None:
+    """Draw samples of all parameters that the search, and a calibration before it (`opened`), changed."""
+    noise = {channel: float(s) for channel, s in zip(data.channels, levels.whole_noise, strict=True)}
+    # the search's uncertainties define which parameters a calibration has
+    machine = with_value(given, "uncertainty", data.machine.uncertainty) if opened else data.machine
+    jitter = _jitter(data, levels)
+    if jitter[0] != jitter[1] and data.sensors:
+        machine = with_value(machine, f"sensors.{data.sensors}.jitter", jitter[0])
+    fits = [(opened.guess, opened.covariance), fit] if opened else [fit]
+    return sample_posterior(machine, fits, noise)
 
 
 def _far(guess: Guess) -> list[str]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from hydrotele.core.units import display_unit
 from hydrotele.effects import EFFECTS
+from hydrotele.gap.posterior import Posterior
 
 SURE = 0.95
 """Probability of a mechanism below which it is called ambiguous."""
@@ -400,6 +401,7 @@ class Gap(Generic[Model]):
         answers: per effect its hierarchical answer as of `gap.answer`; None where no method gives it.
         initial: regressions on measured quantities before the search; None where none were made.
         explanation: candidates, rejections and residual inputs; None where no search gives them.
+        posterior: samples of the parameters of effects and of calibrated parameters; None without any.
     """
 
     machine: Model
@@ -427,6 +429,7 @@ class Gap(Generic[Model]):
     answers: tuple[Mapping[str, Any], ...] | None = None
     initial: InitialRegressions | None = None
     explanation: VerdictExplanation | None = None
+    posterior: Posterior | None = None
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:

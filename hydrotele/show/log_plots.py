@@ -47,6 +47,7 @@ _STYLE = {
     "grid.color": "0.88",
     "grid.linewidth": 0.7,
 }
+_BAND_OPACITY = 0.25
 _FIRST_COLOUR, _OTHER_COLOUR, _DIFFERENCE_COLOUR = "#1f4e79", "#f08a00", "#a32a22"
 
 
@@ -58,6 +59,7 @@ def plot_overlay(
     kinds: Sequence[str] = COMPARED_KINDS,
     size: tuple[int, int] | None = None,
     title: str = "",
+    band: tuple[Log, Log] | None = None,
 ) -> None:
     """Draw two logs as PNG, one plot per common channel, with the difference `first - other` below each.
 
@@ -69,6 +71,7 @@ def plot_overlay(
         kinds: kinds of channels to draw, if both logs have them.
         size: width and height [pixel], default according to the number of channels.
         title: heading, default the names of the logs.
+        band: lower and upper limits of the prediction band of `other`, at its times.
 
     Raises:
         InputError: the logs have no such channel in common or do not overlap in time, or the file
@@ -88,7 +91,7 @@ def plot_overlay(
             for name in channels:
                 axis = parse_channel(name).axis
                 place = grid[row, columns.index(axis)] if axis else grid[row, :]
-                _draw_log_pair(figure, place, first, other, name)
+                _draw_log_pair(figure, place, first, other, name, band)
         keys = [
             *zip(names, (_FIRST_COLOUR, _OTHER_COLOUR), strict=True),
             (" - ".join(names), _DIFFERENCE_COLOUR),
@@ -127,7 +130,9 @@ def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = N
         _draw_title_and_legend(figure, title or log.name, [(axis, c) for axis, c in palette.items() if axis])
 
 
-def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
+def _draw_log_pair(
+    figure: "Figure", place, first: Log, other: Log, name: str, band: tuple[Log, Log] | None = None
+) -> None:
     """Draw a channel of two logs in a cell of the figure's grid and, below, their difference.
 
     Args:
@@ -136,6 +141,7 @@ def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -
         first: log that defines the times of the difference.
         other: log that is subtracted.
         name: name of the channel.
+        band: lower and upper limits of the prediction band of `other`; channels may be missing.
     """
     cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
     upper = figure.add_subplot(cell[0])
@@ -143,6 +149,9 @@ def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -
     ours, theirs = scale_channel_for_plot(first, name), scale_channel_for_plot(other, name)
     upper.plot(first.time, ours.values, color=_FIRST_COLOUR, lw=1.9)
     upper.plot(other.time, theirs.values, color=_OTHER_COLOUR, lw=0.9)
+    if band and name in band[0]:
+        low, high = (scale_channel_for_plot(limit, name).values for limit in band)
+        upper.fill_between(other.time, low, high, color=_OTHER_COLOUR, lw=0.0, alpha=_BAND_OPACITY)
     what = TITLES.get(ours.channel.kind, ours.channel.kind)
     heading = f"{ours.channel.axis} {what}" if ours.channel.axis else what
     _format_axes(upper, first.time, [ours, theirs], heading)
@@ -220,6 +229,7 @@ _MARGIN_FRACTION = 0.15  # margin above and below, relative to the range of the 
 def draw_open_loop_predictions(
     time: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray],
     channels: Sequence[str], units: Sequence[str], title: str,
+    bands: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> bytes:  # fmt: skip
     """Draw measurements and open-loop predictions of several models over time, one panel per channel.
 
@@ -230,6 +240,7 @@ def draw_open_loop_predictions(
         channels: names of the c channels.
         units: SI units of the channels.
         title: title of the figure.
+        bands: {model name: lower and upper limits of its prediction band, each (n, c) in SI units}.
 
     Returns:
         A PNG.
@@ -245,6 +256,10 @@ def draw_open_loop_predictions(
             for k, (name, values) in enumerate(predicted.items()):
                 plot.plot(time, factor * values[:, c], color=_COLOURS[k % len(_COLOURS)], lw=0.9,
                           ls="-" if k < len(_COLOURS) else "--", label=name)  # fmt: skip
+                if bands and name in bands:
+                    low_limit, high_limit = (factor * side[:, c] for side in bands[name])
+                    plot.fill_between(time, low_limit, high_limit, color=_COLOURS[k % len(_COLOURS)], lw=0.0,
+                                      alpha=_BAND_OPACITY)  # fmt: skip
             room = _MARGIN_FRACTION * (high - low) or 1.0
             plot.set_ylim(factor * (low - room), factor * (high + room))
             plot.set_ylabel(channel.replace(".", "\n") + f" [{shown}]")

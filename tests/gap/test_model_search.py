@@ -84,6 +84,8 @@ def test_a_dead_band_of_the_rig_is_found_with_its_size():
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
     found = gap.effects[0].parameters["deadband"]
     assert found.low < true < found.high
+    sampled = np.quantile(gap.posterior.samples[:, 0], (0.025, 0.975))  # of 200: known to 0.2 standard deviations
+    np.testing.assert_allclose(sampled, [found.low, found.high], atol=0.2 * (found.high - found.low))
     (answer,) = gap_document(gap)["answers"]
     assert answer["sure"][:1] == ["slide"]
     assert sum(answer["laws"].values()) + answer["none"] == pytest.approx(1.0)
