@@ -1,5 +1,6 @@
 """Implement `hydrotele replay`: simulate a machine with the commands of a log and compare the result with the log."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from hydrotele.cli.console import (
 from hydrotele.cli.input_logs import OpenedLogs, find_corrected_machine_folder, open_logs
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
-from hydrotele.gap.bands import BandSummary, prediction_band, sample_machines, summarise_band
+from hydrotele.gap.bands import MIN_SAMPLES, BandSummary, prediction_band, sample_machines, summarise_band
 from hydrotele.gap.posterior import Posterior, read_posterior
 from hydrotele.logs.dataset import make_complete_logs
 from hydrotele.logs.log import Log, save_log
@@ -28,6 +29,7 @@ from hydrotele.logs.run_files import check_commands
 from hydrotele.machine.machine import Machine
 from hydrotele.run.replay import Replay, replay_log
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
+from hydrotele.simulate.record import SimulationFailed
 
 _MIN_REPLAY_ROWS = 10  # minimum number of rows of a log
 _DISPLAY_UNITS = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
@@ -145,28 +147,34 @@ def compute_replay_band(
 
     Raises:
         InputError: the log cannot be replayed with a sampled machine.
-        SimulationFailed: the simulation of a sampled machine diverged.
+        SimulationFailed: the simulations of all sampled machines but one diverged.
     """
     log, columns = result.measured, []
     span = float(log.time[-1] - log.time[0])
     names = list(result.channels)
     for number, machine in enumerate(machines):
-        simulated = replay_log(log, machine, timestep).simulated
-        columns.append(np.column_stack([simulated[name] for name in names]))
+        with contextlib.suppress(SimulationFailed):
+            simulated = replay_log(log, machine, timestep).simulated
+            columns.append(np.column_stack([simulated[name] for name in names]))
         if progress:
             progress(span * (number + 1) / len(machines), span)
+    diverged = len(machines) - len(columns)
+    if len(columns) < MIN_SAMPLES:
+        raise SimulationFailed(f"{diverged} of {len(machines)} sampled machines diverged: no band can be computed")
+    if diverged:
+        print_notes([f"{diverged} of {len(machines)} sampled machines diverged; the band is that of the others."])
     exact = any(name.startswith("truth.") for name in log.columns)  # true values have no noise
     noise = [0.0 if exact else posterior.noise.get(name, c.noise_rms) for name, c in result.channels.items()]
     band = prediction_band(np.array(columns), np.array(noise))
     measured = np.column_stack([log[name] for name in names])
-    whole = summarise_band([band], [measured])
+    whole = summarise_band([band], [measured], diverged)
     each = {n: BandSummary(whole.width[k : k + 1], whole.inside[k : k + 1]) for k, n in enumerate(names)}
     units = {name: result.simulated.units[name] for name in names}
     low, high = (
         dataclasses.replace(result.simulated, columns=dict(zip(names, side.T, strict=True)), units=units)
         for side in (band.low, band.high)
     )
-    return ReplayBand(len(machines), each, (low, high))
+    return ReplayBand(len(columns), each, (low, high))
 
 
 def replay_to_dict(result: Replay, band: ReplayBand | None = None) -> dict:
