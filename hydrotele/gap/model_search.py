@@ -22,6 +22,7 @@ from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
+from hydrotele.gap.answer import family_of
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
 from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
@@ -552,7 +553,11 @@ def exchange(
             for model in origin.others if _is_rival(keys_of(model) - keys_of(origin.before), taken)
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
-        models = [settle(evidence, m) if m.score < now.score + _CLOSE else m for m in models]
+        models = [
+            settle(evidence, m) if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken) else m
+            for m in models
+        ]
+        models.sort(key=lambda m: m.score)
         same_size = [m for m in models if len(m.guess.parts) == len(rests)]
         if best is now and same_size and same_size[0].score < now.score:
             best = same_size[0]
@@ -565,6 +570,18 @@ def exchange(
 def _is_rival(added: set[tuple[str, str]], taken: set[tuple[str, str]]) -> bool:
     """Return whether a model adds effects, and none that the accepted model has."""
     return bool(added - {(CALIBRATION, "all")}) and not added & taken
+
+
+def is_of_family(model: Model, hypothesis: Hypothesis, taken: set[tuple[str, str]]) -> bool:
+    """Return whether a model has another effect of the same family at the same place as an accepted one.
+
+    Such a rival may be a special case of the accepted effect, such as one valve gain for both directions. Its fit has
+    to end before the two can be compared, however far behind it is.
+    """
+    return any(
+        location == hypothesis.location and family_of(name) == family_of(hypothesis.name)
+        for name, location in keys_of(model) - taken
+    )
 
 
 def add_rival(evidence: Evidence, rest: Model, origin: Round, model: Model) -> Model:
