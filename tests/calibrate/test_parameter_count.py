@@ -41,7 +41,6 @@ def test_without_loops_equation_5_is_equation_4():
         )  # fmt: skip
 
 
-@pytest.mark.nightly
 def test_slides_through_both_joints_lose_one_parameter_per_leg():
     rng = np.random.default_rng(4)
     assert identifiable_rank(STRAIGHT_HEXAPOD, rng, poses=20) == 42

@@ -133,7 +133,6 @@ def test_progress_names_the_best_explanation():
     assert best_words(Guess()) == ""
 
 
-@pytest.mark.nightly
 def test_the_accepted_effect_covers_the_missing_flow():
     """The hidden leakage of open_08 is 1.6e-11 m^3/(s Pa); the flow that it adds is that which was missing."""
     data = load_dataset([MEASURED / "open_08"], load_machine("cat215"))

@@ -18,7 +18,6 @@ def test_stiffness_is_told_to_22_percent(reference):
     assert found.jnd == pytest.approx(0.22, abs=0.05)
 
 
-@pytest.mark.nightly
 def test_force_is_told_to_7_percent():
     """Pang, Tan and Durlach 1991; three standard errors of 60 trials per level."""
     found = measure_discrimination(make_operator(FILE, None), HAND, "force", 5.0, trials=60)
