@@ -350,7 +350,7 @@ def _write(
     begin, some = _truncate_run_for_plot(run), slice(0, _MAX_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
     channels = dataset.channels[some]
-    shaded = "; shaded: 95 % band of sampled machines" if any(m.bands for m in comparisons) else ""
+    shaded = "; shaded: 95 % band" if any(m.bands for m in comparisons) else ""
     picture = draw_open_loop_predictions(
         time, begin.reading[:, some], {m.name: m.plotted_prediction[:, some] for m in comparisons}, channels,
         [default_channel_unit(channel) for channel in channels],

@@ -216,9 +216,7 @@ def _write_replay_files(folder: Path, name: str, machine, result: Replay, band: 
     save_log(result.simulated, folder / f"{name}_simulated.parquet")
     run = result.measured.metadata.get("run", name)
     title = f"{machine.name}, {run}: measured and replayed"
-    limits = None
-    if band:
-        limits, title = band.limits, f"{title}; shaded: 95 % band of {band.samples} sampled machines"
+    limits = band.limits if band else None
     plot_overlay(result.measured, result.simulated, folder / f"{name}.png", title=title, band=limits)
     entries = {
         "measured": (machine, result.measured.without_truth()),

@@ -49,6 +49,7 @@ _STYLE = {
 }
 _BAND_OPACITY = 0.25
 _FIRST_COLOUR, _OTHER_COLOUR, _DIFFERENCE_COLOUR = "#1f4e79", "#f08a00", "#a32a22"
+_BAND_COLOUR = "#fbd7a6"  # as the other colour looks with the opacity of a band
 
 
 def plot_overlay(
@@ -95,6 +96,7 @@ def plot_overlay(
         keys = [
             *zip(names, (_FIRST_COLOUR, _OTHER_COLOUR), strict=True),
             (" - ".join(names), _DIFFERENCE_COLOUR),
+            *([("95 % band", _BAND_COLOUR)] if band else []),
         ]
         _draw_title_and_legend(figure, title or f"{' and '.join(names)}: {runs}", keys)
 
