@@ -111,7 +111,8 @@ def judge_case(case: Case, document: dict[str, Any]) -> dict[str, Any]:
 def format_row(case: Case, method: str, document: dict[str, Any]) -> str:
     """Return a row of the table."""
     verdict = judge_case(case, document)
-    hidden = ", ".join(" ".join(pairs[0]) for pairs in case.hidden) or ("unmodelled" if not case.is_known else "none")
+    hidden = ", ".join(" ".join(pairs[0]) for pairs in case.hidden if pairs)
+    hidden = hidden or ("none" if case.is_known else "unmodelled")
     named = ", ".join(" ".join(pair) for pair in verdict["named"]) or "-"
     size, answers = document["gap"], document.get("answers") or []
     sure = "; ".join(" / ".join(a["sure"]) or "-" for a in answers) or "-"
