@@ -239,7 +239,7 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         "the shipped scenarios. "
         "Both limits are the geometric mean of the last stable and the first unstable ratio. The "
         f"ratios are a ladder with steps of 1.25 from {LADDER[0]:g} to {LADDER[-1]:.0f} times the "
-        "linear prediction for the settings of the column; with dead bands this prediction is not listed and a few "
+        "linear prediction for the settings of the column. With dead bands this prediction is not listed and a few "
         "per cent smaller than the listed one. Each limit comes from one run per ratio. With dead bands, whether a run "
         "near its limit "
         "becomes unstable also depends on the seed (sensor noise, operator), as the next table shows.",
@@ -250,7 +250,7 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         "", *sides_table(sides, asked.seeds), "",
         "## Stiffness feedback with delay", "",
         "Zhu's theorem 4-2 has the sufficient condition B² > 4 M K_max (mass M, damping B, largest stiffness K_max of "
-        "joystick and hand; B is the damping of the coils plus 8 N s/m of the hand). The published damping of the "
+        "joystick and hand). B is the damping of the coils plus 8 N s/m of the hand. The published damping of the "
         f"coils, 60 N s/m, does not meet it; {DAMPED:g} N s/m are chosen to meet it. The published gains are stable "
         "by the "
         "[bound on the worst switching](stability.md) between the stiffnesses, with which every change of "

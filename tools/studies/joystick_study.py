@@ -253,7 +253,7 @@ def travel() -> list[str]:
         "## Travel and stops", "",
         "Zhu 1994, 5.1.2: \"The joystick workspace is limited by the size of the magnetic gap "
         "[...] approximately + 5 mm translational motion and + 7 deg rotational motion from the "
-        "nominal center.\" The stops are therefore at the coils. Their centre moves by "
+        "nominal center\". The stops are therefore at the coils. Their centre moves by "
         f"{1e3 * limits.translation:g} mm along each axis, and the flotor rotates by "
         f"{np.rad2deg(limits.rotation):g} deg. The centre of the handle is "
         f"{1e3 * JOYSTICK.flotor.handle[2]:g} mm above the coils (A). A rotation about the handle "
