@@ -299,7 +299,7 @@ def compile_mechanism(
         surroundings: objects around the machine.
 
     Returns:
-        A new model; its end stops and bristle inertias are those of MuJoCo's defaults.
+        A new model. `plant.build_plant` adds stiffness and damping of the end stops and the inertias of bristle states.
 
     Raises:
         InputError: the machine's MJCF cannot be assembled.

@@ -21,6 +21,8 @@ from hydrotele.gap.posterior import POSTERIOR_FILE, machine_of_sample, read_post
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.run.replay import replay_log
+from hydrotele.simulate.record import SimulationFailed
 from tests.small_machines import simulate_data
 
 NOISE = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
@@ -183,6 +185,28 @@ def test_replay_draws_the_band_of_the_samples(site, tmp_path, monkeypatch):
     assert written["replays"][0]["channels"]["position.slide"]["band"] == band
     code, out, _ = invoke(*words, "--json")
     assert code == 0 and "band" not in json.loads(out)["channels"]["position.slide"]
+
+
+def test_a_sampled_machine_whose_simulation_diverges_is_left_out_of_the_band(site, monkeypatch):
+    """The first replay is that of the corrected machine, those after it are of the samples."""
+    calls, diverging = [], {2}
+
+    def replay(*arguments):
+        calls.append(arguments)
+        if len(calls) in diverging:
+            raise SimulationFailed("unstable")
+        return replay_log(*arguments)
+
+    monkeypatch.setattr("hydrotele.cli.replay_command.replay_log", replay)
+    log = site / "logs" / "test_1.parquet"
+    words = ("replay", log, "--machine", site / "gap_rig", "--timestep", "0.005", "--bands", "3", "--json")
+    code, out, err = invoke(*words)
+    assert code == 0 and "1 of 3 sampled machines diverged" in err
+    assert json.loads(out)["channels"]["position.slide"]["band"]["samples"] == 2
+    calls.clear()
+    diverging.update({3, 4})
+    result = CliRunner().invoke(cli.app, [str(w) for w in words])
+    assert result.exit_code != 0 and "no band can be computed" in str(result.exception)
 
 
 def test_a_posterior_that_is_missing_or_wrong_is_refused(site, tmp_path):
