@@ -68,7 +68,7 @@ class CodeCache(NullCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the stored compiled code for a signature, or None if this process has to compile it.
 
-        Before None is returned, this process locks the function; `save_overload` releases the lock.
+        Before None is returned, this process locks this form of the function; `save_overload` releases the lock.
         While another process holds the lock, this call waits for its compiled code, for 300 s at
         most. Without a cache folder the result is None at once, without a lock.
         """
@@ -77,11 +77,15 @@ class CodeCache(NullCache):
         target_context.refresh()
         found = self._load(sig, target_context)
         if found is None and self._lock_handle is None:
-            self._lock_handle = _acquire_lock(self._folder, self._function)
+            self._lock_handle = _acquire_lock(self._folder, self._function, self._form)
             found = self._load(sig, target_context)
             if found is not None:
                 self._release_lock()
         return found
+
+    def contains(self, sig: Any, target_context: Any) -> bool:
+        """Return whether there is a cache file for a signature."""
+        return self._folder is not None and self._code_file(self._code_key(sig, target_context.codegen())).exists()
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Write the compiled code of a signature to a cache file, if possible, and release the function's lock.
@@ -166,14 +170,15 @@ def _write_atomically(path: Path, content: bytes) -> None:
             part.unlink(missing_ok=True)
 
 
-def _acquire_lock(folder: Path, function) -> int | None:
-    """Lock a function's cache against other processes; return the handle of the open lock file.
+def _acquire_lock(folder: Path, function, form: str) -> int | None:
+    """Lock one form of a function's code against other processes; return the handle of the open lock file.
 
     While another process holds the lock, the call waits, and after 1 s shows a status line on
     stderr. Returns None after 300 s of waiting, and if the lock file cannot be opened or locked.
     """
     try:
-        handle = os.open(folder / f"{cache_file_stem(function)}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        path = folder / f"{cache_file_stem(function)}.{form}.lock"
+        handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError:
         return None
     began, line = time.monotonic(), ProgressLine()

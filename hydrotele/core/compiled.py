@@ -29,6 +29,7 @@ from numba.core import event
 from numba.core.caching import NullCache
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
+from numba.core.types import Omitted
 
 from hydrotele.core.code_cache import CodeCache, cache_file_stem
 from hydrotele.core.compile_progress import CompileProgress
@@ -71,7 +72,8 @@ def _make_dispatcher(function, **options: Any):
 
     A dispatcher compiles the function for each combination of argument types. The second one is
     attached to the first. It has no wrapper that converts Python objects. The wrapper takes a fifth
-    of the compile time, and most functions are never called from Python.
+    of the compile time, and most functions are never called from Python. Where the second one has
+    code for the argument types that is linked by symbol, the first one compiles the wrapper only.
 
     Args:
         function: the Python function.
@@ -90,10 +92,37 @@ def _make_dispatcher(function, **options: Any):
     made._cache = _function_cache(function, "python")
     called._cache = _function_cache(function, "called")
     callee = Callee(called, inline=options.get("forceinline", False))
-    made.get_call_template, made.get_overload = callee.call_template, callee.overload_key
+    for dispatcher in (made, called):
+        dispatcher.get_call_template, dispatcher.get_overload = callee.call_template, callee.overload_key
+    if callee.is_separate and isinstance(called._cache, CodeCache):
+        forward = _make_forwarding_function(function, called)
+
+        def choose_function(args, keywords):
+            is_compiled = args in called.overloads or called._cache.contains(args, called.targetctx)
+            has_defaults = any(isinstance(kind, Omitted) for kind in args)
+            return forward if is_compiled and not has_defaults else function
+
+        made._compiler._get_implementation = choose_function
     type_of = made.typeof_pyval
     made.typeof_pyval = lambda value: argument_type(type_of(value))
     return made
+
+
+def _make_forwarding_function(function, target):
+    """Return a Python function with the arguments of a function that returns the result of `target`.
+
+    Args:
+        function: the function, with positional arguments only.
+        target: the function that is called, a global variable of the result; numba does not cache closures.
+    """
+    code = function.__code__
+    names = ", ".join(code.co_varnames[: code.co_argcount])
+    namespace = {"__target": target}
+    exec(f"def forward({names}):\n    return __target({names})", namespace)
+    forward = namespace["forward"]
+    forward.__module__, forward.__name__ = function.__module__, function.__name__
+    forward.__qualname__ = f"{function.__qualname__}_forward"
+    return forward
 
 
 def callback(signature):
