@@ -43,7 +43,8 @@ def for_c(x):
 def test_cached_code_is_loaded_with_what_it_calls(tmp_path):
     """Also where a function that it calls was compiled again and has another symbol since.
 
-    Called from Python, a function that compiled code calls as well is not compiled again: its code refers to the symbol.
+    Called from Python, a function that compiled code calls as well is not compiled again: its code
+    refers to the symbol.
     """
     package = tmp_path / "hydrotele"
     shutil.copytree(PACKAGE / "core", package / "core")
