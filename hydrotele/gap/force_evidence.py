@@ -36,6 +36,7 @@ from hydrotele.identify.estimation import compute_weights, estimate_error_varian
 from hydrotele.identify.linear_least_squares import fit_autoregression
 
 MAX_SIGN_DOUBT = 0.25  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
+_ORDER_SHARE = 1.0 / 3.0  # of that time, which the autoregression of the noise may span: it must not follow the motion
 _NOISE_ROUNDS = 3  # of estimating noise and coefficients in turn
 _EFFECTS_PER_DRIVE = 3  # rounds of a search: Coulomb and viscous friction and one more of each drive
 _MIN_EFFECTS = 8  # rounds
@@ -80,10 +81,11 @@ class NoiseShape(NamedTuple):
             parts.append(np.einsum("ij,njm->nim", self.white, own))
         return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
-    def forces(self, sizes: np.ndarray) -> np.ndarray:
-        """Return the slow forces of the drives (k,) [N] or [N m] of uncorrelated channels of some sizes (k,)."""
-        back = np.linalg.inv(self.white) * sizes
-        return np.sqrt(np.sum(back**2, axis=1)) / np.abs(1.0 - self.follow.sum(axis=0))
+    def missing_forces(self, rest: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+        """Return the RMS (k,) of errors (n, k) beyond the noise [N] or [N m]."""
+        weight = self.weights(doubt)
+        square = np.sum((weight * rest) ** 2, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1.0)
+        return np.sqrt(np.maximum(square - self.std**2, 0.0))
 
 
 def estimate_noise(columns: Columns) -> NoiseShape:
@@ -101,7 +103,8 @@ def estimate_noise(columns: Columns) -> NoiseShape:
     """
     n, k, _ = columns.matrix.shape
     wide = typical_sizes(columns)
-    matrix, gap = columns.matrix[:, :, wide > 0.0] * wide[wide > 0.0], columns.gap
+    matrix = np.concatenate([columns.matrix[:, :, wide > 0.0] * wide[wide > 0.0], _free_laws(columns)], axis=2)
+    gap = columns.gap
     std = np.maximum(np.std(gap, axis=0), 1e-12)
     shape = NoiseShape(np.zeros((0, k)), np.diag(1.0 / std), np.tile([1.0, 0.0], (k, 1)), std)
     for _ in range(_NOISE_ROUNDS):
@@ -114,6 +117,27 @@ def estimate_noise(columns: Columns) -> NoiseShape:
         rest, kept = _without_slow(rest, columns)
         shape = _shape_of(rest, columns, max(kept - used, 0.1))
     return shape
+
+
+def _free_laws(columns: Columns) -> np.ndarray:
+    """(n, k, l) forces of a typical size that are any function of the position or the rate of their own drive."""
+    size, out = TYPICAL * np.sqrt(np.mean(columns.measured**2, axis=0)), []
+    for k, drive in enumerate(columns.drives):
+        for name in (f"position.{drive}", f"velocity.{drive}"):
+            if name in columns.states:
+                made = np.zeros((*columns.gap.shape, _KNOTS[1]))
+                made[:, k] = size[k] * _hats([columns.states[name]])
+                out.append(made)
+    return np.concatenate(out, axis=2) if out else np.zeros((*columns.gap.shape, 0))
+
+
+def _hats(series: Sequence[np.ndarray]) -> np.ndarray:
+    """Hat functions (n, l) of one or two variables (n,), or their products."""
+    weights = np.ones((len(series[0]), 1))
+    for values in series:
+        points = np.linspace(*np.quantile(values, _QUANTILES), _KNOTS[len(series)])
+        weights = (weights[:, :, None] * hat_weights(values, points)[:, None, :]).reshape(len(values), -1)
+    return weights
 
 
 def typical_sizes(columns: Columns) -> np.ndarray:
@@ -142,7 +166,8 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     left, starts = rest * weight, columns.starts
     std = np.sqrt(np.sum(left**2, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1.0) / free)
     runs = [left[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
-    order = len(fit_autoregression(max(runs, key=len)))
+    longest = max(1, int(_ORDER_SHARE * MEMORY / columns.spacing))  # what lasts longer is a residual force
+    order = min(len(fit_autoregression(max(runs, key=len))), longest)
     follow = np.mean([fit_autoregression(run, order) for run in runs if len(run) > 4 * order], axis=0)
     plain = plain._replace(follow=follow, std=np.maximum(std, 1e-12))
     new = plain.prewhiten(rest, columns.doubt, starts)
@@ -192,8 +217,8 @@ class ForceEvidence:
             columns: of the runs.
             shape: of their noise.
             uncertain: parameters of the model with their priors.
-            form: column -> standard deviation of what is never known: the form of friction near rest, the time between
-                forces and positions within a row. They are marginalised for every guess.
+            form: column -> standard deviation of what is never known: the form of friction near rest. It is
+                marginalised for every guess.
         """
         self.columns, self.shape, order = columns, shape, len(shape.follow)
         self.keep: Callable[[Judged], None] = lambda judged: None
@@ -307,14 +332,6 @@ class ForceEvidence:
         found: Any = tuple(tracks)
         return Judged(guess, found, sum(t.loss for t in tracks) + levels.penalty + more + guess.prior)
 
-    def channel_losses(self, judged: Judged) -> tuple[np.ndarray, np.ndarray]:
-        """Return -2 log likelihood of each channel (k,), and what a model without residual forces would leave."""
-        whitened = np.concatenate([t.whitened for t in judged.tracks])
-        spread = np.concatenate([t.gains.spread for t in judged.tracks])
-        there, levels = np.isfinite(whitened), judged.tracks[0].levels
-        rows = np.where(there, whitened**2 + 2.0 * np.log(spread), 0.0)
-        return rows.sum(axis=0), there.sum(axis=0) * (1.0 + 2.0 * np.log(levels.noise))
-
     def _most_likely(self, left: np.ndarray, levels: Levels) -> Levels:
         """Levels of the noise and of the residual forces, channel by channel, by maximum posterior density."""
         noise, sizes, penalty = levels.noise.copy(), levels.sizes.copy(), 0.0
@@ -340,12 +357,11 @@ class ForceEvidence:
     def residual_gain(self, judged: Judged) -> np.ndarray:
         """Return twice the log likelihood ratio (k,) of a residual force in each channel against none."""
         levels = judged.tracks[0].levels
-        own, _ = self.channel_losses(judged)
-        left = (self._values @ self._along(judged.guess))[:, :, None]
-        none = replace(levels, sizes=np.full(len(own), np.exp(_LOG_SIZES[0])))
-        whitened, spread = self._filtered(left, none)
-        rows = np.where(self._missing, 0.0, whitened[:, :, 0] ** 2 + 2.0 * np.log(spread))
-        return rows.sum(axis=0) - own
+        left, losses = (self._values @ self._along(judged.guess))[:, :, None], []
+        for sizes in (levels.sizes, np.full(len(levels.sizes), np.exp(_LOG_SIZES[0]))):
+            whitened, spread = self._filtered(left, replace(levels, sizes=sizes))
+            losses.append(np.sum(whitened[:, :, 0] ** 2 + 2.0 * np.log(spread), axis=0))
+        return losses[1] - losses[0]
 
     # -- search --
 
@@ -450,11 +466,7 @@ class ForceEvidence:
         self.set_base(judged)
         groups = []
         for series in variables:
-            weights = np.ones((len(force), 1))
-            for values in series:
-                points = np.linspace(*np.quantile(values, _QUANTILES), _KNOTS[len(series)])
-                weights = (weights[:, :, None] * hat_weights(values, points)[:, None, :]).reshape(len(force), -1)
-            made = force[:, :, None] * weights[:, None, :]
+            made = force[:, :, None] * _hats(series)[:, None, :]
             groups.append(self._columns(self.shape.prewhiten(made, self.columns.doubt, self.columns.starts)))
         own = self._values @ self._moves(judged.guess, judged.guess.nudges())
         form = self._values[:, :, self._form] / np.sqrt(self._form_precision)

@@ -197,6 +197,12 @@ def find_mechanism_gap(
     evidence, found = _search(task, effects, tell)
     tell("evaluate the patched model on the held-out run", 0.9)
     chances = _probabilities(evidence, found)
+    import os
+    if os.environ.get("DBG"):
+        for i,(h, v) in enumerate(found.guess.parts):
+            print("FOUND", h.key, {} if h.name==CALIBRATION else h.values(v), found.charges[i], None if found.without[i] is None else found.without[i].loss-found.judged.loss, chances.get(h.key))
+        print("LOSS", found.base.loss, found.judged.loss, found.base.tracks[0].levels, found.judged.tracks[0].levels, evidence.shape.std, evidence.shape.follow.shape)
+        for h, v in task.effects_of(found.guess): print("SMALL", h.key, _is_small(h, v))
     small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)}
     judged, untrue = _without(evidence, found.judged, small), []
     varying: dict[Key, str] = {}
@@ -301,9 +307,9 @@ def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> 
 def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
     """Return what no model knows: column -> standard deviation.
 
-    How dry friction acts near rest, how sharply it turns, and the time between forces and positions within a row.
+    How dry friction acts near rest, and how sharply it turns.
     """
-    form = {"delay.force": 0.5 * columns.row}
+    form: dict[str, float] = {}
     for one in mechanism.setup.friction_terms:
         dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
         if one.location in columns.drives and dry > 0.0:
@@ -328,6 +334,11 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
         found = search_model(
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
+        import os
+        if os.environ.get("DBG"):
+            for i,(h, v) in enumerate(found.guess.parts):
+                print("ROUND", turn, h.key, {} if h.name==CALIBRATION else h.values(v), found.charges[i], None if found.without[i] is None else found.without[i].loss-found.judged.loss)
+            print("LOSS", time.perf_counter(), found.base.loss, found.judged.loss, found.base.tracks[0].levels.noise, found.base.tracks[0].levels.sizes, found.judged.tracks[0].levels.noise, found.judged.tracks[0].levels.sizes,evidence.shape.std)
         known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
         value = evidence.coefficients(found.guess)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
@@ -412,9 +423,15 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged) -> _Result:
     heldout = _evidence(task, now, evidence.shape)
     sizes = []
     for one, own in ((evidence, judged), (heldout, heldout.judged(Guess()))):
-        shown = one.residual_gain(own) > MIN_LOG_BAYES_FACTOR
-        sizes.append(np.where(shown, evidence.shape.forces(own.tracks[0].levels.sizes), 0.0))
+        sizes.append(_missing(one, own))
     return _Result(judged, patched, then, now, np.array(sizes))
+
+
+def _missing(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
+    """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
+    rest = evidence.columns.gap - evidence.force_of(judged.guess)
+    found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
+    return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
 
 
 def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float:
@@ -429,8 +446,8 @@ def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float
 def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
     """Effect -> its probability, and those of its alternatives.
 
-    The probability against rivals and none is scaled with that of the part which the effect takes of what the drive
-    that it moves most lacked.
+    The probability against rivals and none is scaled with that of the fraction of the residual force's variance which
+    the effect explains, on the drive that it moves most.
     """
     out = {}
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
@@ -441,9 +458,8 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
         moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
         own = int(np.argmax(moved / evidence.shape.std))
-        now, ideal = (loss[own] for loss in evidence.channel_losses(found.judged))
-        without = evidence.channel_losses(rest)[0][own]
-        trust = believed_part((without - now) / max(without - min(ideal, now), 1.0))
+        now, without = (_missing(evidence, one)[own] ** 2 for one in (found.judged, rest))
+        trust = believed_part(1.0 - now / without if without > now else 0.0)
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
             for r, chance in zip(rivals, table[2:], strict=True) if chance >= _MIN_PROBABILITY
