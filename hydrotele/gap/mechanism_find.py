@@ -23,7 +23,7 @@ from hydrotele.estimate.hypothesis import CALIBRATION, Guess
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
-from hydrotele.gap.find import Progress, detail_words, verdict_of, without_details
+from hydrotele.gap.find import Progress, verdict_of, without_details
 from hydrotele.gap.force_evidence import ForceEvidence, NoiseShape, calibration_of, estimate_noise
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
@@ -197,31 +197,28 @@ def find_mechanism_gap(
     evidence, found = _search(task, effects, tell)
     tell("evaluate the patched model on the held-out run", 0.9)
     chances = _probabilities(evidence, found)
-    import os
-    if os.environ.get("DBG"):
-        for i,(h, v) in enumerate(found.guess.parts):
-            print("FOUND", h.key, {} if h.name==CALIBRATION else h.values(v), found.charges[i], None if found.without[i] is None else found.without[i].loss-found.judged.loss, chances.get(h.key))
-        print("LOSS", found.base.loss, found.judged.loss, found.base.tracks[0].levels, found.judged.tracks[0].levels, evidence.shape.std, evidence.shape.follow.shape)
-        for h, v in task.effects_of(found.guess): print("SMALL", h.key, _is_small(h, v))
-    small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)}
-    judged, untrue = _without(evidence, found.judged, small), []
+    small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
+             for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
+    judged, untrue = _without(evidence, found.judged, small), list(small.values())
     varying: dict[Key, str] = {}
     while varying := _varying(evidence, judged):
         untrue += varying.values()
         judged = _without(evidence, judged, varying)
     details: tuple[NamedEffect, ...] = ()
-    result = _evaluate(task, evidence, judged)
+    then = build_columns([heldout], mechanism, task.band)
+    result = _evaluate(task, evidence, judged, then)
     while True:
         if not _error_ratio(task, evidence, result) <= _WORSE:
             untrue.append(_REJECTED)
             evidence, found = _unfitted(task)
-            result = _evaluate(task, evidence, found.judged)
+            result = _evaluate(task, evidence, found.judged, then)
         named = _named(task, evidence, result, chances)
         named, more = without_details(named, bool(result.lacking.any()), task.drives)
         details += more
         if not more:
             break
-        result = _evaluate(task, evidence, _without(evidence, result.judged, {(e.name, e.location) for e in more}))
+        judged = _without(evidence, result.judged, {(e.name, e.location) for e in more})
+        result = _evaluate(task, evidence, judged, then)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
     lacks = _lacks(task, result)
@@ -232,7 +229,10 @@ def find_mechanism_gap(
         unknown = replace(unknown, depends_on=depends, channel=_channels(task)[task.drives.index(lacks[0].axis)])
     rms = [np.sqrt(np.nanmean(one[0].whitened ** 2, axis=0)) for one in (before, after)]
     total = [float(np.sqrt(np.mean(one**2))) for one in rms]
-    more = [f"Forces are compared below {task.band:.3g} Hz.", *map(detail_words, details)]
+    more = [
+        f"Forces are compared below {task.band:.3g} Hz.",
+        *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
+    ]
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
              for k, drive in enumerate(task.drives) if result.lacking[1, k] and not result.lacking[0, k]]  # fmt: skip
     more += [words for effect in named if (words := answer_words(effect))]
@@ -334,11 +334,6 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
         found = search_model(
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
-        import os
-        if os.environ.get("DBG"):
-            for i,(h, v) in enumerate(found.guess.parts):
-                print("ROUND", turn, h.key, {} if h.name==CALIBRATION else h.values(v), found.charges[i], None if found.without[i] is None else found.without[i].loss-found.judged.loss)
-            print("LOSS", time.perf_counter(), found.base.loss, found.judged.loss, found.base.tracks[0].levels.noise, found.base.tracks[0].levels.sizes, found.judged.tracks[0].levels.noise, found.judged.tracks[0].levels.sizes,evidence.shape.std)
         known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
         value = evidence.coefficients(found.guess)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
@@ -372,6 +367,11 @@ def _is_small(effect: MechanismEffect, values: np.ndarray) -> bool:
     return float(np.linalg.norm(change)) < 1.0
 
 
+def _not_named(key: Key, values: Mapping[str, float]) -> str:
+    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+    return f"{key[0]} at {key[1]} ({told}) is too small to be named; the patched model does not contain it."
+
+
 def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
     """Fit a model again without some effects."""
     if not dropped:
@@ -398,10 +398,9 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     return told
 
 
-def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged) -> _Result:
+def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Columns) -> _Result:
     """Patch the MJCF with a model and evaluate it on the held-out run."""
     mechanism, columns = task.mechanism, evidence.columns
-    then = build_columns([task.heldout], mechanism, task.band)
     patched, now = task.given, then
     if judged.guess.parts:
         numbers = {
@@ -477,7 +476,7 @@ def _named(
         return ()
     spread = np.sqrt(np.diag(evidence.covariance(result.judged)))
     rows = min(len(then.time), len(now.time))
-    own, shape = _evidence(task, then, evidence.shape), evidence.shape
+    shape = evidence.shape
     before, after = (shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now))
     whole, first, named = float(np.mean(before**2)) - 1.0, 0, []
     for hypothesis, deviation in guess.parts:
@@ -485,7 +484,8 @@ def _named(
         first += hypothesis.size
         if hypothesis.name == CALIBRATION:
             continue
-        added = shape.weights(then.doubt)[:rows] * own.force_of(Guess(((hypothesis, deviation),)))[:rows] / shape.std
+        force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
+        added = shape.weights(then.doubt)[:rows] * force / shape.std
         back = float(np.mean((after + added) ** 2) - np.mean(after**2))
         share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         values, numbers = hypothesis.values(deviation), {}
