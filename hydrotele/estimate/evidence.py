@@ -397,28 +397,47 @@ class Evidence:
             fresh = self.slopes(there, errors, parallel, step, first)
             return fresh if kept is None else np.hstack([kept, fresh])
 
-        errors = self.errors(guess, step, parallel=parallel)
-        loss = _loss(errors, guess)
-        slopes = slopes_at(guess, errors)
-        for _ in range(steps):
-            d, move = guess.deviation, _move(guess, slopes, errors)
-            better = None
-            for shrink in (1.0, 0.5, 0.2, 0.05):
-                moved = guess.at(d + shrink * move)
-                tried = self.errors(moved, step, parallel=parallel)
-                if (lower := _loss(tried, moved)) < loss - 1e-9:
-                    better = (moved, tried, lower)
-                    break
-            if better is None:
+        return fit_guess(guess, before, steps, lambda g: self.errors(g, step, parallel=parallel), slopes_at)
+
+
+def fit_guess(
+    guess: Guess, before: float, steps: int, errors_of: Callable[[Guess], np.ndarray],
+    slopes_of: Callable[[Guess, np.ndarray], np.ndarray],
+) -> Fit:  # fmt: skip
+    """Fit the parameters of a guess by Gauss-Newton with halved steps.
+
+    Args:
+        guess: where to start.
+        before: loss of the guess without its last part, for the gain.
+        steps: largest number of Gauss-Newton steps.
+        errors_of: function guess -> (E,) whitened errors.
+        slopes_of: function (guess, its errors) -> (E, P) change of the errors per deviation.
+
+    Returns:
+        The fit.
+    """
+    errors = errors_of(guess)
+    loss = _loss(errors, guess)
+    slopes = slopes_of(guess, errors)
+    for _ in range(steps):
+        d, move = guess.deviation, _move(guess, slopes, errors)
+        better = None
+        for shrink in (1.0, 0.5, 0.2, 0.05):
+            moved = guess.at(d + shrink * move)
+            tried = errors_of(moved)
+            if (lower := _loss(tried, moved)) < loss - 1e-9:
+                better = (moved, tried, lower)
                 break
-            fall = loss - better[2]
-            guess, errors, loss = better
-            if fall < _CLOSE:
-                break
-            slopes = slopes_at(guess, errors)
-        information = slopes.T @ slopes + np.eye(slopes.shape[1])
-        last = guess.parts[-1][0].size if guess.parts else 0
-        return Fit(guess, loss, before - loss, occam_penalty(information, last), information)
+        if better is None:
+            break
+        fall = loss - better[2]
+        guess, errors, loss = better
+        if fall < _CLOSE:
+            break
+        slopes = slopes_of(guess, errors)
+    information = slopes.T @ slopes + np.eye(slopes.shape[1])
+    last = guess.parts[-1][0].size if guess.parts else 0
+    return Fit(guess, loss, before - loss, occam_penalty(information, last), information)
 
 
 def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
@@ -537,7 +556,8 @@ def posterior_covariance(evidence: Evidence, guess: Guess, scatter: float = 1.0)
     information = slopes.T @ slopes + np.eye(slopes.shape[1])
     covariance = invert_information(information)
     plain = np.diag(covariance)
-    widening = np.sqrt(np.maximum(plain, _sandwich(evidence, slopes, covariance)) / plain)
+    scores = sandwich_variances(evidence.tracks, evidence.base_errors, slopes, covariance)
+    widening = np.sqrt(np.maximum(plain, scores) / plain)
     shift = covariance @ (slopes.T @ evidence.step_effect(guess, 0.5 * step))
     widened = scatter if scatter > _CHANCE else 1.0
     whole = widened * covariance * np.outer(widening, widening) + np.outer(shift, shift) / 3.0
@@ -655,12 +675,23 @@ def _beyond_dents(evidence: Evidence, guess: Guess, alone: np.ndarray) -> np.nda
     return found
 
 
-def _sandwich(evidence: Evidence, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(P,) variances from how unlike stretches of the runs pull at the numbers."""
-    errors, pulls, at = evidence.base_errors, [], 0
-    whole = sum(len(track.whitened) * track.run.period for track in evidence.tracks)
+def sandwich_variances(
+    tracks: Sequence[Track], errors: np.ndarray, slopes: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Return the variances (P,) that follow from how unlike stretches of the runs pull at the parameters.
+
+    Args:
+        tracks: of the fitted guess.
+        errors: (E,) its whitened errors.
+        slopes: (E, P) change of the errors per deviation.
+        covariance: (P, P) inverse information.
+
+    Source: White 1982, Econometrica 50(1), section 3.
+    """
+    pulls, at = [], 0
+    whole = sum(len(track.whitened) * track.run.period for track in tracks)
     seconds = float(np.clip(whole / _STRETCHES, MEMORY, BLOCK))
-    for track in evidence.tracks:
+    for track in tracks:
         rows, channels = track.whitened.shape
         count = max(1, int(rows * track.run.period / seconds))
         edges = at + channels * np.linspace(0, rows, count + 1).astype(int)

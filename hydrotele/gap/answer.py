@@ -21,8 +21,12 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
         "load_dependent_friction", "position_dependent_friction", "speed_dependent_force", "warming",
     ),
     "leakage": ("internal_leakage", "tank_leakage", "orifice_leakage"),
-    "compliance": ("hose_compliance", "bulk_modulus", "entrained_air", "joint_flexibility", "backlash"),
-    "inertia": ("com_offset", "inertia_error", "payload", "base_tilt"),
+    "compliance": ("hose_compliance", "bulk_modulus", "entrained_air", "joint_flexibility", "backlash", "joint_spring"),
+    "inertia": ("com_offset", "inertia_error", "payload", "base_tilt", "drive_inertia"),
+    "sensor": (
+        "force_offset", "force_scale", "force_delay", "angle_offset", "length_offset", "angle_delay", "length_delay",
+        "clock_offset",
+    ),
     "external force": ("external_force", "force_pulse", "end_stop_stiffness"),
 }  # fmt: skip
 """Family -> names of effects, where the part of the model that an effect changes is not its family."""

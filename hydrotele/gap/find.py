@@ -28,6 +28,7 @@ from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
+from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
 from hydrotele.gap.posterior import Posterior, sample_posterior
 from hydrotele.gap.profiles import find_profiles, profile_words
@@ -122,7 +123,6 @@ def find_gap(
         CannotFollowError: the filter of the given machine cannot follow the readings.
         InputError: a custom effect allows no value, or its file raised an error.
     """
-    find = search_model if method == "regression" else search
     begin = time.perf_counter()
     report = progress or (lambda text, share: None)
     given, notes = data.machine, []
@@ -156,7 +156,10 @@ def find_gap(
 
     evidence.keep = keep_best
     try:
-        found = find(evidence, candidates, tell)
+        if method == "regression":
+            found = search_model(MachineModel(evidence), candidates, tell)
+        else:
+            found = search(evidence, candidates, tell)
         discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):

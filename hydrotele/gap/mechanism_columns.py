@@ -16,6 +16,7 @@ from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Parameter
+from hydrotele.estimate.hypothesis import Hypothesis
 from hydrotele.identify.equations import (
     RateErrors,
     apply_low_pass,
@@ -67,6 +68,7 @@ class Columns:
         spacing: between rows [s].
         row: between the readings that they are made of [s].
         runs: names.
+        drives: names of the k drives.
     """
 
     names: tuple[str, ...]
@@ -82,22 +84,12 @@ class Columns:
     spacing: float
     row: float
     runs: tuple[str, ...]
+    drives: tuple[str, ...]
 
     @property
     def gap(self) -> np.ndarray:
         """(n, k) measured less modelled."""
         return self.measured - self.modelled
-
-    def part(self, first: int, last: int) -> "Columns":
-        """Equations `first` to `last`, of one run, as if they were all."""
-        rows = slice(first, last)
-        run = self.runs[int(np.searchsorted(self.starts, first, side="right")) - 1]
-        return replace(
-            self, matrix=self.matrix[rows], measured=self.measured[rows],
-            modelled=self.modelled[rows], time=self.time[rows], starts=(0, last - first),
-            doubt=self.doubt[rows], runs=(run,),
-            states={name: values[rows] for name, values in self.states.items()},
-        )  # fmt: skip
 
     def moved(self, value: Mapping[str, float]) -> "Columns":
         """Columns whose model has some coefficients, column -> value, added."""
@@ -219,7 +211,7 @@ def build_columns(
     }
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
-        states, sizes, band, parts[0][7], row, tuple(r.name for r in records),
+        states, sizes, band, parts[0][7], row, tuple(r.name for r in records), tuple(setup.chain.drives),
     )  # fmt: skip
 
 
@@ -462,46 +454,18 @@ Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class MechanismEffect:
-    """An effect at a place.
+class MechanismEffect(Hypothesis):
+    """An effect at a joint, a drive, a body, `force` or `base`, as a combination of columns.
 
     Attributes:
-        name: see `SENTENCES`.
-        location: a joint, a drive, a body, `force` or `base`.
-        parameters: name -> number, with its prior (`scale` about `start`) and its bounds.
         columns: those that it acts through.
-        coefficients: (p,) parameters -> (c,) what they add to the given model along the columns.
-        start: (p,) mean of the prior.
+        coefficients: (p,) parameter values -> (c,) what they add to the given model along the columns.
         variant: number of the form, where there are several.
     """
 
-    name: str
-    location: str
-    parameters: Mapping[str, Parameter]
-    columns: tuple[str, ...]
-    coefficients: Callable[[np.ndarray], np.ndarray]
-    start: np.ndarray
+    columns: tuple[str, ...] = ()
+    coefficients: Callable[[np.ndarray], np.ndarray] = lambda values: values
     variant: int = 0
-
-    @property
-    def key(self) -> Key:
-        """Name and place."""
-        return self.name, self.location
-
-    @property
-    def scale(self) -> np.ndarray:
-        """(p,) standard deviations of the prior."""
-        return np.array([one.prior_std for one in self.parameters.values()])
-
-    @property
-    def low(self) -> np.ndarray:
-        """(p,) smallest values."""
-        return np.array([one.lower_bound for one in self.parameters.values()])
-
-    @property
-    def high(self) -> np.ndarray:
-        """(p,) largest values."""
-        return np.array([one.upper_bound for one in self.parameters.values()])
 
 
 def strengths(columns: Columns) -> np.ndarray:
@@ -580,8 +544,7 @@ class _Builder:
         if facts is None:
             return None
         return MechanismEffect(
-            name, place, {parameter: facts}, (column,), lambda p: p - nominal, np.array([nominal]),
-            variant,
+            name, place, {parameter: facts}, None, (column,), lambda p: p - nominal, variant,
         )  # fmt: skip
 
     def units(self, joint: str) -> tuple[str, str, str, str]:
@@ -638,9 +601,12 @@ class _Builder:
         def coefficients(p: np.ndarray) -> np.ndarray:
             return np.array([p[0] - stiff, p[0] * (middle - p[1]) - stiff * (middle - rest)])
 
+        start = stiff + facts.prior_std
+        facts = replace(facts, start_values=(start, start, start))
+        slack = replace(slack, start_values=(centre, centre - travel, centre + travel))
         return MechanismEffect(
-            "joint_spring", drive, {"stiffness": facts, "rest": slack},
-            (f"spring.{drive}", f"offset.{drive}"), coefficients, np.array([stiff, centre]),
+            "joint_spring", drive, {"stiffness": facts, "rest": slack}, None,
+            (f"spring.{drive}", f"offset.{drive}"), coefficients,
         )  # fmt: skip
 
     def bodies(self):
@@ -668,19 +634,18 @@ class _Builder:
         if share < _NONE:
             return None
         scale = TYPICAL / share
-        load = Parameter("kg", 0.0, -0.9 * mass, _MOST * scale, scale, LEAST / share)
+        aside = np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])  # where a load is looked for, in radii of gyration
+        loads = tuple(sign * scale for sign in (1.0, -1.0) for _ in aside)
+        load = Parameter("kg", 0.0, -0.9 * mass, _MOST * scale, scale, LEAST / share, loads)
         place = {
-            axis: Parameter("m", c, c - 3.0 * size, c + 3.0 * size, size, 0.0)
-            for axis, c in zip("xyz", centre.tolist(), strict=True)
+            axis: Parameter("m", c, c - 3.0 * size, c + 3.0 * size, size, 0.0, tuple(c + size * way) * 2)
+            for axis, c, way in zip("xyz", centre.tolist(), aside.T, strict=True)
         }
 
         def coefficients(p: np.ndarray) -> np.ndarray:
             return np.concatenate([[p[0]], p[0] * p[1:], p[0] * _point(p[1:])])
 
-        return MechanismEffect(
-            "payload", body, {"mass": load, **place}, names, coefficients,
-            np.concatenate([[0.0], centre]),
-        )  # fmt: skip
+        return MechanismEffect("payload", body, {"mass": load, **place}, None, names, coefficients)
 
     def moved(self, body, names, mass, centre, size) -> MechanismEffect | None:
         share = mass * max(self.strength[n] for n in names[:3])
@@ -693,7 +658,7 @@ class _Builder:
             change = mass * (_point(centre + p) - _point(centre))
             return np.concatenate([mass * p, change])
 
-        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3))
+        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), None, names, coefficients)
 
     def turned(self, body, names, own) -> MechanismEffect | None:
         upper = own[np.triu_indices(3)]
@@ -704,9 +669,8 @@ class _Builder:
         least = min(LEAST / share, _NOTABLE)
         ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
         return MechanismEffect(
-            "inertia_error", body, {"ratio": ratio}, names, lambda p: (p[0] - 1.0) * upper,
-            np.ones(1),
-        )  # fmt: skip
+            "inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper
+        )
 
     def sensors(self):
         """Defects of sensors, and the base."""
@@ -728,7 +692,7 @@ class _Builder:
         if facts is None:
             return None
         facts = Parameter("s", 0.0, low, _SECOND, min(facts.prior_std, 0.02), facts.min_relevant_change)
-        return MechanismEffect(name, place, {"delay": facts}, (column,), lambda p: p, np.zeros(1))
+        return MechanismEffect(name, place, {"delay": facts}, None, (column,))
 
     def scale(self, drive: str) -> MechanismEffect | None:
         column = f"scale.force.{drive}"
@@ -740,9 +704,9 @@ class _Builder:
             "force_scale",
             drive,
             {"scale": facts},
+            None,
             (column,),
             lambda p: (p - 1.0) / known,
-            np.ones(1),
         )
 
     def tilt(self) -> MechanismEffect | None:
@@ -750,10 +714,7 @@ class _Builder:
         if share < _NONE:
             return None
         way = Parameter("rad", 0.0, -0.3, 0.3, 0.03, LEAST / share)
-        return MechanismEffect(
-            "base_tilt", "base", {"x": way, "y": way}, ("tilt.x", "tilt.y"), lambda p: p,
-            np.zeros(2),
-        )  # fmt: skip
+        return MechanismEffect("base_tilt", "base", {"x": way, "y": way}, None, ("tilt.x", "tilt.y"))
 
 
 def _point(place: np.ndarray) -> np.ndarray:

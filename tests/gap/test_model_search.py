@@ -12,7 +12,7 @@ from hydrotele.estimate.track import STEP
 from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.model_search import scale_residual_inputs
+from hydrotele.gap.machine_model import scale_residual_inputs
 from hydrotele.gap.profiles import find_profiles
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset

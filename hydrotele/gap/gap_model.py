@@ -1,0 +1,121 @@
+"""What the gap search needs of a model: errors, sensitivities, priors and noise levels, behind one interface.
+
+Two models implement it: `gap.machine_model` for the reduced model of a hydraulic machine in a Kalman filter, and
+`gap.force_evidence` for the inverse dynamics of any MJCF. `gap.model_search` knows no other property of a model.
+`docs/gap_method.md` states the objective that both evaluate.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from hydrotele.estimate.evidence import Fit, Judged
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.gap.dictionary import Version
+from hydrotele.gap.regression import NormalEquations
+
+
+class Linearisation(Protocol):
+    """Columns of versions of effects, and of nuisance parameters, about one model."""
+
+    @property
+    def versions(self) -> Sequence[Version]:
+        """The versions that the model can follow."""
+        ...
+
+    @property
+    def own(self) -> np.ndarray:
+        """Return for each nuisance column (K,) whether it is a parameter of the model itself."""
+        ...
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of the rows that the columns hold."""
+        ...
+
+    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[NormalEquations, float]:
+        """Return the normal equations with scaled residual inputs, and -2 log likelihood of the errors.
+
+        Args:
+            residual_scale: factor on the standard deviations of the residual inputs.
+            joined: indices of versions that form one group together; one group per version if empty.
+        """
+        ...
+
+
+class GapModel(Protocol):
+    """A model and its runs, for `gap.model_search`.
+
+    A guess is a set of effects with parameters. The base is the guess whose filter gains and noise levels the errors of
+    other guesses are whitened with.
+    """
+
+    keep: Callable[[Judged], None]
+    """Called with every model that the search accepts."""
+
+    max_effects: int
+    """Number of rounds after which a search ends."""
+
+    def prepare(self, candidates: Sequence[Hypothesis], given: Judged) -> list[Hypothesis]:
+        """Return the candidates with start values that the residual inputs of the given model suggest."""
+        ...
+
+    def uncertain_parameters(self, guess: Guess, scale: float = 1.0) -> Hypothesis:
+        """Return the uncertain parameters that a guess does not have as one group, empty if it has that group.
+
+        Args:
+            guess: the guess.
+            scale: standard deviation of their priors relative to the stated one.
+        """
+        ...
+
+    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """Re-estimate the noise levels of a guess, starting from those of the base.
+
+        Args:
+            guess: the guess.
+            same: whether the base is nearly the same guess.
+            reopened: whether residual inputs that the base does not need are tried again.
+        """
+        ...
+
+    def set_base(self, judged: Judged) -> Judged:
+        """Whiten the errors of later guesses with the gains of this one; return it."""
+        ...
+
+    def fit(self, guess: Guess, steps: int) -> Fit:
+        """Fit the parameters of a guess with the gains of the base."""
+        ...
+
+    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
+        """Alternate fits and estimates of the noise levels until neither changes; the result is the base."""
+        ...
+
+    def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
+        """Fit an extension of a model and re-estimate its noise levels; None if the model cannot follow the runs.
+
+        Args:
+            now: the model, which is the base before and afterwards.
+            guess: its extension.
+            residual_scale: factor on the residual inputs with which the fit begins.
+            dense: whether many parameters are added, whose sensitivities are computed once.
+        """
+        ...
+
+    def linearise(self, guess: Guess, versions: Sequence[Version], uncertain: Hypothesis) -> Linearisation:
+        """Compute the columns of versions and of the uncertain parameters about the base."""
+        ...
+
+    def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:
+        """Return the base with coloured noise of the channels that show it, None without any.
+
+        Args:
+            judged: the base.
+            min_gain: twice the log likelihood that the coloured noise of a channel must bring.
+        """
+        ...
+
+    def compare_noise(self, judged: Judged, min_gain: float) -> Judged:
+        """Find the coloured noise of the base again; return the model with the most evidence, which is the base."""
+        ...
