@@ -30,7 +30,7 @@ _TIMES = 10  # over time: what acts for a while begins and ends somewhere
 _STEEP = 0.3  # precision of first differences, in units of the lack: beyond what the data tell a
 # law goes on as it is there, not as steeply as it was
 _SHRINK = 0.1  # precision of an entry, in units of the lack: what no data tells is nothing
-_OWN = (
+OWN_VARIABLES = (
     "velocity", "position", "command", "force", "pressure_head", "pressure_rod", "spool",
     "pump_speed", "pressure_supply", "time",
 )  # fmt: skip
@@ -220,7 +220,7 @@ def possible_tables(
     Returns:
         The tables.
     """
-    points = {n: _points(n, values, _POINTS, smoothing, window) for n in _names(values)}
+    points = {n: place_points(n, values, _POINTS, smoothing, window) for n in _names(values)}
     return [Table((n,), (p,), window) for n, p in points.items() if p]
 
 
@@ -242,7 +242,7 @@ def paired_tables(
         The tables; none has two variables that only their drives tell apart.
     """
     names = [n for n in _names(values) if others or "." not in n]
-    points = {n: _points(n, values, _PAIR_POINTS, smoothing, window) for n in names}
+    points = {n: place_points(n, values, _PAIR_POINTS, smoothing, window) for n in names}
     pairs = itertools.combinations([n for n in names if points[n]], 2)
     return [
         Table((a, b), (points[a], points[b]), window) for a, b in pairs
@@ -324,10 +324,10 @@ def finer_memories(table: Table, step: float) -> list[Table]:
 
 def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     others = [n for n in values[0] if "." in n and n.partition(".")[0] in DRIVE_VARIABLES]
-    return [n for n in (*_OWN, *others) if n in values[0]]
+    return [n for n in (*OWN_VARIABLES, *others) if n in values[0]]
 
 
-def _points(
+def place_points(
     name: str, values: Sequence[Mapping[str, np.ndarray]], count: int, smoothing: float,
     window: tuple[float, ...],
 ) -> tuple[float, ...]:  # fmt: skip

@@ -11,7 +11,7 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,9 @@ from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_vari
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
-from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
+from hydrotele.gap.discover import see_run
+from hydrotele.gap.laws import LawForm, LawHypothesis, list_forms, list_pairs
+from hydrotele.gap.regression import Marginal, NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
 from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Rival, moved_last
 from hydrotele.gap.screening import Screened, timed
@@ -126,18 +128,27 @@ class Proposal:
     parameter_scale: float = 0.0
 
     @property
+    def law(self) -> LawForm | None:
+        """The law or profile; None of effects and of the calibration."""
+        first = self.parts[0][0] if self.parts else None
+        return first.form if isinstance(first, LawHypothesis) else None
+
+    @property
     def key(self) -> tuple[str, str]:
         """Name and location of the first effect."""
         return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
 
 
-def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
+def search_model(
+    evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None, has_laws: bool = False
+) -> Found:
     """Find the effects that the data ask for.
 
     Args:
         evidence: on the fit runs, with noise levels that it estimates.
         candidates: the effects.
         progress: called with (what is done, fraction done).
+        has_laws: whether laws without a known cause are learned.
 
     Returns:
         The model, its rivals, and the first ranking.
@@ -147,6 +158,7 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     given = Model(settle_noise(evidence, evidence.judged(Guess())))
     evidence.keep(given.judged)
     candidates = timed([c for c in candidates if c.name not in _EXCLUDED], given.judged)
+    effects = list(dict.fromkeys(c.name for c in candidates))
     now, first = given, tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
@@ -154,9 +166,9 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         share = 0.05 + 0.8 * index / _MAX_EFFECTS
         tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals = propose(evidence, now, pool)
+        proposals = propose(evidence, now, pool, effects, has_laws)
         first = first or tuple(proposals)
-        keys = keys or {p.key for p in proposals[:_KEPT]}
+        keys = keys or {p.key for p in [p for p in proposals if not p.law][:_KEPT]}
         tell("refine the best effects", share + 0.03)
         models = extensions(evidence, now, proposals)
         better = min((*models, *colour_noise(evidence, now)), key=lambda m: m.charged_score, default=now)
@@ -209,7 +221,10 @@ def settle(evidence: Evidence, model: Model) -> Model:
 # -- linear step ------------------------------------------------------------------------------------------------------
 
 
-def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
+def propose(
+    evidence: Evidence, now: Model, candidates: Sequence[Hypothesis], effects: Collection[str] = (),
+    has_laws: bool = False,
+) -> list[Proposal]:  # fmt: skip
     """Rank effects by their Bayes factors in the linearised model.
 
     The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
@@ -220,6 +235,8 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
         evidence: whose base is the model.
         now: the model.
         candidates: effects that may be added.
+        effects: names of effects whose coefficient may vary.
+        has_laws: whether learned laws are compared, too.
 
     Returns:
         Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first.
@@ -235,26 +252,38 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     best: dict[tuple[str, str], Proposal] = {}
     chosen: dict[tuple[str, str], int] = {}
     gains: dict[float, float] = {}
-    has_calibration, start = (CALIBRATION, "all") in taken, None
-    for residual_scale in RESIDUAL_SCALES:
-        terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
-        for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration else None]:
-            marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
-            total = loss - terms.squares + marginal.loss
-            start = total if start is None else start
-            gained = (start - total) / fraction
-            if parameter_scale > 0.0:
-                _keep(best, Proposal((), gained, residual_scale, parameter_scale))
-                continue
-            factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
-            gains[residual_scale] = gained
-            for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
-                part = version.hypothesis, version.deviation(mean)
-                proposal = Proposal((part,), gained + float(factor) / fraction, residual_scale)
-                if _keep(best, proposal):
-                    chosen[proposal.key] = index
+    has_calibration = (CALIBRATION, "all") in taken
+    starts: list[float] = []
+
+    def compare(table: Dictionary) -> None:
+        for residual_scale in RESIDUAL_SCALES:
+            terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
+            for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration or table.laws else None]:
+                marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
+                total = loss - terms.squares + marginal.loss
+                starts.append(total)
+                gained = (starts[0] - total) / fraction
+                if parameter_scale > 0.0:
+                    _keep(best, Proposal((), gained, residual_scale, parameter_scale))
+                    continue
+                gains[residual_scale] = gained
+                for index, part, factor in _compare_columns(table, terms, marginal):
+                    proposal = Proposal((part,), gained + factor / fraction, residual_scale)
+                    if _keep(best, proposal) and not table.laws:
+                        chosen[proposal.key] = index
+
+    compare(table)
+    model = now.guess.machine(machine)
+    seen = [see_run(model, evidence.data, track) for track in tracks]
+    forms = list_forms(evidence, now.judged, seen, effects, has_laws)
+    if forms:
+        compare(table.with_laws(forms, model, tracks, seen, evidence.map))
+        free = [form for form in forms if not form.effect]
+        if free:
+            leader = max(free, key=lambda form: best[form.key].factor)
+            compare(table.with_laws(list_pairs(evidence, seen, leader), model, tracks, seen, evidence.map))
     ranked = sorted(best.values(), key=lambda p: -p.factor)
-    single = [p for p in ranked if p.parts]
+    single = [p for p in ranked if p.key in chosen]
     if not single:
         return ranked
     scale = single[0].residual_scale
@@ -263,6 +292,25 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     if pair is None:
         return ranked
     return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked]
+
+
+def _compare_columns(
+    table: Dictionary, terms: NormalEquations, marginal: Marginal
+) -> Iterator[tuple[int, tuple[Hypothesis, np.ndarray], float]]:
+    """Yield the place of each version, or of each law with each of its priors, its start, and twice its factor."""
+    if not table.laws:
+        factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
+        for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
+            yield index, (version.hypothesis, version.deviation(mean)), float(factor)
+    for index, law in enumerate(table.laws):
+        right, block = marginal.right[terms.edges[index] : terms.edges[index + 1]], marginal.blocks[index]
+        found = []
+        for root in law.roots():
+            edges = np.array([0, root.shape[1]])
+            (factor,), (mean,) = compare_groups(edges, root.T @ right, [root.T @ block @ root])
+            found.append((float(factor), root, mean))
+        factor, root, mean = max(found, key=lambda one: one[0])
+        yield index, (law.hypothesis(root), mean), factor
 
 
 def propose_pair(
@@ -324,12 +372,13 @@ def _normal_equations(
 ) -> tuple[NormalEquations, float]:
     """Normal equations with the residual inputs scaled, and -2 log likelihood of the errors there."""
     edges = np.cumsum([0, *(t.whitened.size for t in tracks)])
-    widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
+    groups = table.law_columns if table.laws else table.columns
+    widths = np.cumsum([0, *(c.shape[1] for c in groups), table.nuisance.shape[1]])
 
     def of_run(index: int) -> tuple[NormalEquations, float]:
         track, rows = tracks[index], slice(edges[index], edges[index + 1])
         scaled = scale_residual_inputs(track, residual_scale)
-        columns = np.hstack([*(c[rows] for c in table.columns), table.nuisance[rows]]).astype(float)
+        columns = np.hstack([*(c[rows] for c in groups), table.nuisance[rows]]).astype(float)
         missing = ~np.isfinite(track.whitened)
         if residual_scale != 1.0:
             there = columns.reshape(*track.whitened.shape, -1)
@@ -338,9 +387,9 @@ def _normal_equations(
                 track.gains.slope, track.flow, missing, track.gains.gain, scaled.gains.gain, there,
             )  # fmt: skip
             there /= np.where(missing, 1.0, scaled.gains.spread)[:, :, None]
-        groups = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
+        parts = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
         errors = -np.nan_to_num(scaled.whitened).ravel()
-        return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
+        return NormalEquations.of(errors, parts, columns[:, widths[-2] :]), scaled.loss
 
     found = evidence.map(of_run, range(len(tracks)))
     terms = found[0][0]
@@ -384,7 +433,11 @@ def scale_levels(levels: Levels, scale: float) -> Levels:
 
 def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
     """Refine the best proposals that the linear step holds for better than the model."""
-    chosen = [p for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
+    better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
+    laws = [p for p in better if p.law]
+    chosen = [p for p in better if not p.law][:_TRIED]
+    for is_profile in (False, True):
+        chosen += [p for p in laws if p.law and bool(p.law.effect) == is_profile][:1]
     return [m for m in (refine(evidence, now, p) for p in chosen) if m is not None]
 
 

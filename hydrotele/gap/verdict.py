@@ -1,0 +1,140 @@
+"""Acceptance and verdict of the gap search by regression.
+
+They follow from three things alone: the posterior of the effects, the held-out run (predictive likelihood and open-loop
+prediction), and residual tests of the final model.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.estimate.evidence import Evidence, Judged
+from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.estimate.levels import columns_of
+from hydrotele.estimate.track import track_run
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR
+from hydrotele.gap.result import LIKELY, SURE, LearnedLaw, NamedEffect, Verdict
+
+_AHEAD = 1.0  # s, of open-loop predictions: several correlation times of the residual inputs
+_STEP = 2.0e-3  # s, of their integrator
+_LOST = 1.0e3  # times the noise: larger errors say no more
+_NORMAL95 = 1.645  # quantile of a one-sided test at 95 %
+
+
+class HeldOut(NamedTuple):
+    """Two models compared on the held-out run, which neither was fitted to.
+
+    Attributes:
+        log_ratio: twice the log ratio of the predictive likelihoods, each with noise levels and residual inputs of its
+            own; positive if the final model is better.
+        open_loop: mean log ratio of the errors of open-loop predictions over 1 s, final to given model; NaN if the run
+            is too short.
+        deviation: standard error of that mean.
+    """
+
+    log_ratio: float
+    open_loop: float
+    deviation: float
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the run is evidence against the final model."""
+        return self.log_ratio < -MIN_LOG_BAYES_FACTOR or self.open_loop > _NORMAL95 * self.deviation
+
+    @property
+    def words(self) -> str:
+        """The comparison in a sentence."""
+        text = f"On the held-out run, twice the log likelihood of the changed model is {self.log_ratio:+,.0f} higher"
+        if math.isfinite(self.open_loop):
+            change = 100.0 * math.expm1(self.open_loop)
+            text += (
+                f", and its open-loop errors over {_AHEAD:g} s change by {change:+.0f} %"
+                f" (standard error {100.0 * self.deviation:.0f} %)"
+            )
+        return f"{text}." + (" The changes were rejected, and no effect is named." if self.is_worse else "")
+
+
+def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOut:
+    """Compare the given and the final model on the held-out run.
+
+    Args:
+        evidence: with the data.
+        given: the given machine.
+        final: the machine with effects, laws and calibrated parameters.
+    """
+    run = evidence.data.heldout
+
+    def loss(judged: Judged) -> float:
+        machine, levels = judged.guess.machine(evidence.data.machine), judged.tracks[0].levels
+        plain = dataclasses.replace(levels, inputs=(), sizes=np.zeros(0))
+        near = track_run(machine, evidence.data, run, levels=plain, linearise=True)
+        columns = columns_of(machine, near, levels.inputs)
+        return track_run(machine, evidence.data, run, levels=levels, columns=columns, rest=near.rest).loss
+
+    def errors(judged: Judged) -> np.ndarray:
+        """Return the log errors of open-loop windows in units of the noise of the given model; at least 0."""
+        runner = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)(run)
+        found = free_run_errors(runner, run, (_AHEAD,), to_end=False).horizons.get(f"{_AHEAD:g}")
+        if found is None:
+            return np.zeros(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a window without readings
+            sizes = np.sqrt(np.nanmean((found.each / given.tracks[0].levels.whole_noise) ** 2, axis=1))
+        return np.log(np.clip(sizes, 1.0, _LOST))
+
+    losses, windows = evidence.map(loss, (given, final)), evidence.map(errors, (given, final))
+    change = windows[1] - windows[0]
+    change = change[np.isfinite(change)]
+    mean = float(change.mean()) if len(change) else math.nan
+    deviation = float(change.std(ddof=1)) / math.sqrt(len(change)) if len(change) > 1 else math.nan
+    return HeldOut(losses[0] - losses[1], mean, deviation)
+
+
+def count_unexplained(
+    named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], left: Mapping[str, float], lost: Collection[str]
+) -> tuple[NamedEffect, ...]:
+    """Return the effects with probabilities that count what remains on their axes as "none of them".
+
+    Where a residual test fails, or a law without a known cause was learned, something acts that the library does not
+    hold. An effect may imitate a part of it. Its probability is multiplied with the fraction of the gap of its axis
+    that named effects close.
+
+    Args:
+        named: the effects, with probabilities among the effects of the library and none.
+        laws: learned laws.
+        left: axis -> fraction of its gap that remains, "" -> of all channels.
+        lost: axes on which something remains, "" for channels without axis.
+    """
+    found = []
+    for effect in named:
+        place = effect.location.partition(".")[0]
+        axis = place if place in left else ""
+        if not lost or (axis and axis not in lost):
+            found.append(effect)
+            continue
+        rest = left[axis] + sum(law.share for law in laws if axis in ("", law.axis) and math.isfinite(law.share))
+        known = max(0.0, 1.0 - rest)
+        others = tuple(dataclasses.replace(a, probability=known * a.probability) for a in effect.alternatives)
+        found.append(dataclasses.replace(effect, probability=known * effect.probability, alternatives=others))
+    return tuple(sorted(found, key=lambda effect: -effect.probability))
+
+
+def verdict_of(named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], failed: bool, floor: float | None) -> Verdict:
+    """Return the verdict.
+
+    Args:
+        named: the effects.
+        laws: learned laws without a known cause.
+        failed: whether a residual test of the final model fails.
+        floor: error of a perfect model; None if it is not known.
+    """
+    likely = [e for e in named if e.mechanism_probability > LIKELY]
+    if not named and not laws:
+        return "unknown" if failed or floor is None else "no_gap"
+    if failed or laws:
+        return "partly" if likely else "unknown" if failed else "learned"
+    return "named" if all(e.mechanism_probability >= SURE for e in named) else "ambiguous"
