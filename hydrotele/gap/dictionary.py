@@ -91,7 +91,7 @@ class Dictionary:
         nuisance: (E, K) the same of the model's own and of the uncertain parameters.
         own: (K,) whether a nuisance column is a parameter of the model itself.
         laws: L laws and profiles.
-        law_columns: per law (E, K) change of the whitened errors per unit of each coefficient.
+        law_columns: per law (E, q) change of the whitened errors per unit of each function of its basis.
     """
 
     versions: tuple[Version, ...]

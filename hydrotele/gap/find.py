@@ -225,7 +225,7 @@ def find_gap(
         named = count_unexplained(named, learned, left, _lost(tests, learned, 0.0))
         verdict = verdict_of_regression(named, learned, failed, None if judge.ripple else floor)
         method_notes += [words for effect in named if (words := answer_words(effect))]
-        if held_out:
+        if held_out and not held_out.is_worse:
             method_notes.append(held_out.words)
     else:
         failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)

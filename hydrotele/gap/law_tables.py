@@ -220,7 +220,7 @@ def possible_tables(
     Returns:
         The tables.
     """
-    points = {n: place_points(n, values, _POINTS, smoothing, window) for n in _names(values)}
+    points = {n: _points(n, values, _POINTS, smoothing, window) for n in _names(values)}
     return [Table((n,), (p,), window) for n, p in points.items() if p]
 
 
@@ -242,7 +242,7 @@ def paired_tables(
         The tables; none has two variables that only their drives tell apart.
     """
     names = [n for n in _names(values) if others or "." not in n]
-    points = {n: place_points(n, values, _PAIR_POINTS, smoothing, window) for n in names}
+    points = {n: _points(n, values, _PAIR_POINTS, smoothing, window) for n in names}
     pairs = itertools.combinations([n for n in names if points[n]], 2)
     return [
         Table((a, b), (points[a], points[b]), window) for a, b in pairs
@@ -327,7 +327,7 @@ def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     return [n for n in (*OWN_VARIABLES, *others) if n in values[0]]
 
 
-def place_points(
+def _points(
     name: str, values: Sequence[Mapping[str, np.ndarray]], count: int, smoothing: float,
     window: tuple[float, ...],
 ) -> tuple[float, ...]:  # fmt: skip

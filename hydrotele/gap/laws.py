@@ -1,9 +1,9 @@
 """Learned laws and profiles as groups of columns of the regression.
 
 A group adds `sum_k c_k B_k(x) phi(state)` to a balance of one drive, with hat functions B_k of one variable x or
-products of hat functions of two. A learned law has phi = 1. A profile has the form phi of a library effect, whose coefficient
-then varies with x: friction that is larger at one position, leakage in the worn middle of a stroke. The coefficients c
-have a smooth normal prior, so that the evidence decides how many of them count.
+products of hat functions of two. A learned law has phi = 1. A profile has the form phi of a library effect, whose
+coefficient then varies with x: friction that is larger at one position, leakage in the worn middle of a stroke. The
+coefficients c have a smooth normal prior, so that the evidence decides how many of them count.
 
 The columns follow from the linearised filter: the change of the states per row that a unit of the balance makes, times
 the hat functions. The corrected machine states a group as a term (`hydrotele.terms`).
@@ -26,19 +26,21 @@ from hydrotele.estimate.levels import columns_of
 from hydrotele.estimate.track import Track, error_responses
 from hydrotele.gap.description import variable_unit
 from hydrotele.gap.discover import Learned, Seen, see_run
-from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Table, place_points
+from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Table
 from hydrotele.gap.result import VARIES, Estimate, NamedEffect, Profile
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.term import Term
 
-_KNOTS, _PAIR_KNOTS = 9, 6  # of a law over one variable, and of each of two: a tenth of the range, and what time allows
-_LENGTHS = (1.0, 3.0)  # correlation lengths of the prior of the coefficients, in knots; the evidence selects one
+_KNOTS = {1: 17, 2: 9}  # of a table over one variable, and of each of two
+_LENGTHS = {1: (0.12, 0.4), 2: (0.2, 0.5)}
+"""Number of variables -> correlation lengths of the prior of the coefficients, as fractions of the range of a variable.
+The evidence selects one. Two lengths of the table's steps hold in the shorter one, so that a smooth law is well met."""
 _SIZES = (0.1, 1.0, 10.0)  # prior standard deviations, in typical sizes; the evidence selects one
 _TYPICAL = 0.01  # of the largest force, flow or command: the size at which residual inputs start, too
 _WIDEST = 100.0  # prior standard deviations; no bound
 _NORMAL95 = 1.96
-_ROUNDING = 1e-3  # of the largest eigenvalue of a prior: smaller ones change a law by less than 3 %
+_ROUNDING = {1: 1e-6, 2: 1e-3}  # of the largest eigenvalue of a prior: errors of a law of 0.1 %, and of 3 % over two
 
 
 class Form(NamedTuple):
@@ -85,19 +87,34 @@ _VARIED_BY = ("position", "velocity", "command", "force", "pressure_head", "pres
 
 
 @cache
-def prior_roots(counts: tuple[int, ...], length: float) -> np.ndarray:
-    """Return the root (K, q) of a unit prior covariance of hat coefficients on a grid of knots.
+def smooth_basis(counts: tuple[int, ...]) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Return smooth functions on a grid of knots, and the roots of prior covariances of their coefficients.
+
+    The covariance of the values at the knots is squared-exponential in the number of the knot, with unit variance. Its
+    largest eigenvectors for the shortest length are the functions.
 
     Args:
         counts: knots of each variable, K in all.
-        length: correlation length of the squared-exponential covariance, in knots.
+
+    Returns:
+        (K, q) functions, and a root (q, r) per length of `_LENGTHS`.
     """
-    whole = np.ones((1, 1))
-    for n in counts:
-        whole = np.kron(whole, np.exp(-0.5 * (np.subtract.outer(np.arange(n), np.arange(n)) / length) ** 2))
-    sizes, ways = np.linalg.eigh(whole)
-    kept = sizes > _ROUNDING * sizes[-1]
-    return ways[:, kept] * np.sqrt(sizes[kept])
+
+    def covariance(length: float) -> np.ndarray:
+        whole = np.ones((1, 1))
+        for n in counts:
+            apart = np.subtract.outer(np.arange(n), np.arange(n)) / (length * (n - 1))
+            whole = np.kron(whole, np.exp(-0.5 * apart**2))
+        return whole
+
+    def root(matrix: np.ndarray) -> np.ndarray:
+        sizes, ways = np.linalg.eigh(matrix)
+        kept = sizes > _ROUNDING[len(counts)] * sizes[-1]
+        return ways[:, kept] * np.sqrt(sizes[kept])
+
+    lengths = _LENGTHS[len(counts)]
+    basis = np.linalg.qr(root(covariance(lengths[0])))[0]
+    return basis, tuple(root(basis.T @ covariance(length) @ basis) for length in lengths)
 
 
 @dataclass(frozen=True)
@@ -130,30 +147,41 @@ class LawForm:
         return f"{LEARNED}_{self.balance}", f"{self.axis}.{self.table.name}"
 
     @property
+    def kind(self) -> str:
+        """Whether it is a profile, or a law over one or two variables; the best of each kind is refined."""
+        return "profile" if self.effect else f"law over {len(self.table.variables)}"
+
+    @property
     def sides(self) -> tuple[tuple[str, float], ...]:
         """Balances of the filter's inputs, with the sign of the law in each."""
         return (("flow_head", -1.0), ("flow_rod", 1.0)) if self.balance == THROUGH else ((self.balance, 1.0),)
 
     def roots(self) -> list[np.ndarray]:
-        """Return the roots (K, q) of the prior covariances that are compared [unit of a coefficient]."""
-        counts = tuple(map(len, self.table.points))
-        return [size * self.size * prior_roots(counts, length) for size in _SIZES for length in _LENGTHS]
+        """Return the roots (q, r) of the prior covariances that are compared, of the coefficients of `basis`."""
+        _, roots = smooth_basis(tuple(map(len, self.table.points)))
+        return [size * self.size * root for size in _SIZES for root in roots]
+
+    @property
+    def basis(self) -> np.ndarray:
+        """(K, q) smooth functions at the K points of the table."""
+        return smooth_basis(tuple(map(len, self.table.points)))[0]
 
     def shares(self, seen: Seen) -> np.ndarray:
-        """Return what a unit of each coefficient adds along a run (n, K); 0 in rows that are not used."""
+        """Return what a unit at each point of the table adds along a run (n, K)."""
         values = seen.values[self.axis]
         found = self.table.columns(values)
         if self.effect:
             form = FORMS[self.effect]
             found = found * (form.sign * form.along(values, self.constants))[:, None]
-        return np.where(seen.known[:, None], found, 0.0)
+        return np.nan_to_num(found)
 
     def columns(self, machine: Machine, track: Track, seen: Seen) -> np.ndarray:
-        """Return the change (n c, K) of a track's whitened errors per unit of each coefficient."""
+        """Return the change (n c, q) of a track's whitened errors per unit of each function of `basis`."""
         names = [Input(balance, self.axis) for balance, _ in self.sides]
         unit = columns_of(machine, track, names)
         unit = sum(sign * unit[:, k] for k, (_, sign) in enumerate(self.sides))
-        return error_responses(track, unit, self.shares(seen)).reshape(-1, self.table.size)
+        responses = error_responses(track, unit, self.shares(seen) @ self.basis)
+        return responses.reshape(-1, responses.shape[2])
 
     def terms(self, entries: np.ndarray, taken: Collection[str]) -> list[Term]:
         """Return the terms of a machine with some coefficients (K,); none has a name that is taken."""
@@ -174,13 +202,13 @@ class LawForm:
         ]  # fmt: skip
 
     def hypothesis(self, root: np.ndarray) -> "LawHypothesis":
-        """Return the law as a hypothesis with q unit-normal parameters, its coefficients being `root` times these."""
+        """Return the law as a hypothesis with r unit-normal parameters; `root` (q, r) as of `roots`."""
         one = Parameter("1", 0.0, -_WIDEST, _WIDEST, 1.0, 0.0)
         parameters = {str(k + 1): one for k in range(root.shape[1])}
 
         def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
             taken = {term.name for term in nominal.terms if term.axis == self.axis}
-            new = self.terms(root @ np.array([values[key] for key in parameters]), taken)
+            new = self.terms(self.basis @ root @ np.array([values[key] for key in parameters]), taken)
             return nominal.model_copy(update={"terms": (*nominal.terms, *new)})
 
         return LawHypothesis(*self.key, parameters, change, form=self, root=root)
@@ -200,14 +228,14 @@ class LawHypothesis(Hypothesis):
 
     Attributes:
         form: the law.
-        root: (K, q) coefficients per parameter.
+        root: (q, r) coefficients of the basis per parameter.
     """
 
     form: LawForm = field(kw_only=True)
     root: np.ndarray = field(kw_only=True)
 
     def responses(self, machine: Machine, data: Dataset, track: Track) -> np.ndarray:
-        """Return the change (n c, q) of a track's whitened errors per parameter, see `Hypothesis.responses`."""
+        """Return the change (n c, r) of a track's whitened errors per parameter, see `Hypothesis.responses`."""
         return self.form.columns(machine, track, see_run(machine, data, track)) @ self.root
 
 
@@ -225,12 +253,9 @@ def list_forms(
     """
     machine, forms = evidence.data.machine, list[LawForm]()
     for balance, axis in _balances(judged):
-        facts, values = machine.axes[axis], [s.values[axis] for s in seen]
+        facts = machine.axes[axis]
         smoothing = facts.drive.friction.smoothing_velocity
-        tables = {
-            v: Table((v,), (points,)) for v in OWN_VARIABLES if v in values[0]
-            and (points := place_points(v, values, _KNOTS, smoothing, ()))
-        }  # fmt: skip
+        tables = {v: Table((v,), (points,)) for v, points in place_knots(seen, axis, _KNOTS[1], smoothing).items()}
         if has_laws:
             size = _TYPICAL * float(input_sizes(machine, [Input(_side(balance), axis)])[0])
             forms += [LawForm(balance, axis, table, size, smoothing) for table in tables.values()]
@@ -254,17 +279,36 @@ def list_forms(
     return forms
 
 
-def list_pairs(evidence: Evidence, seen: Sequence[Seen], single: LawForm) -> list[LawForm]:
+def list_pairs(seen: Sequence[Seen], single: LawForm) -> list[LawForm]:
     """Return the laws over products of two variables at the place of a law over one."""
-    values = [s.values[single.axis] for s in seen]
-    points = {
-        v: p for v in OWN_VARIABLES if v in values[0]
-        and (p := place_points(v, values, _PAIR_KNOTS, single.smoothing, ()))
-    }  # fmt: skip
+    points = place_knots(seen, single.axis, _KNOTS[2], single.smoothing)
     return [
         LawForm(single.balance, single.axis, Table((a, b), (points[a], points[b])), single.size, single.smoothing)
         for a, b in combinations(points, 2)
     ]  # fmt: skip
+
+
+def place_knots(seen: Sequence[Seen], axis: str, count: int, smoothing: float) -> dict[str, tuple[float, ...]]:
+    """Return the points of a table over each variable of a drive that moves.
+
+    They lie half-way between even spacing and quantiles, from the smallest to the largest value. Friction changes its
+    sign within the smoothing velocity [m/s] or [rad/s]; points of the velocity lie at its ends, and none within twice.
+    """
+    found = {}
+    for name in OWN_VARIABLES:
+        if name not in seen[0].values[axis]:
+            continue
+        x = np.concatenate([s.values[axis][name] for s in seen])
+        x = x[np.isfinite(x)]
+        if not len(x) or not np.ptp(x) > 0.0:
+            continue
+        points = set(0.5 * (np.quantile(x, np.linspace(0.0, 1.0, count)) + np.linspace(x.min(), x.max(), count)))
+        if name == "velocity" and min(-x.min(), x.max()) > 2.0 * smoothing:
+            points = {p for p in points if abs(p) > 2.0 * smoothing} | {-smoothing, smoothing}
+        rounded = sorted({float(f"{p:.6g}") for p in points})
+        if len(rounded) > 1:
+            found[name] = tuple(rounded)
+    return found
 
 
 def _side(balance: str) -> str:
@@ -292,7 +336,7 @@ def learned_of(evidence: Evidence, judged: Judged, covariance: np.ndarray) -> tu
         first += hypothesis.size
         if not isinstance(hypothesis, LawHypothesis):
             continue
-        form, root = hypothesis.form, hypothesis.root
+        form, root = hypothesis.form, hypothesis.form.basis @ hypothesis.root
         runs = [see_run(machine, evidence.data, t).values[form.axis] for t in judged.tracks]
         everywhere = {v: np.concatenate([x[v] for x in runs]) for v in runs[0]}
         found.append(Learned(

@@ -211,11 +211,59 @@ def settle_noise(evidence: Evidence, judged: Judged) -> Judged:
 
 
 def settle(evidence: Evidence, model: Model) -> Model:
-    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base."""
+    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base.
+
+    The prior of a law was selected while residual inputs hid a part of it. It is selected again as long as that brings
+    evidence.
+    """
     if not model.guess.parts:
         return Model(settle_noise(evidence, model.judged))
-    judged, fit = fit_until_settled(evidence, model.judged)
+    found = _settle_fit(evidence, model.judged)
+    while any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
+        again = _settle_fit(evidence, evidence.judged(select_priors(evidence, found.guess), same=True))
+        if again.score > found.score - _SETTLED:
+            evidence.set_base(found.judged)
+            break
+        found = again
+    return found
+
+
+def _settle_fit(evidence: Evidence, judged: Judged) -> Model:
+    judged, fit = fit_until_settled(evidence, judged)
     return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
+
+
+def select_priors(evidence: Evidence, guess: Guess) -> Guess:
+    """Select the prior of every learned law and profile by its evidence, in the linearised model.
+
+    Args:
+        evidence: with the guess as its base.
+        guess: all effects.
+    """
+    parts, slopes, first = list(guess.parts), evidence.base_slopes(evidence.slope_step), 0
+    for index, (hypothesis, deviation) in enumerate(guess.parts):
+        own = slice(first, first + hypothesis.size)
+        first += hypothesis.size
+        if not isinstance(hypothesis, LawHypothesis):
+            continue
+        form = hypothesis.form
+        columns = evidence.responses(form.hypothesis(np.eye(form.basis.shape[1])), evidence.tracks)
+        assert columns is not None
+        target = columns @ (hypothesis.root @ deviation) - evidence.base_errors
+        others = np.delete(slopes, own, axis=1)
+        marginal = NormalEquations.of(target, [columns], others).marginalise(np.full(others.shape[1], _OWN_SCALE))
+        _, root, mean = _best_prior(form, marginal.right, marginal.blocks[0])
+        parts[index] = form.hypothesis(root), mean
+    return Guess(tuple(parts))
+
+
+def _best_prior(form: LawForm, right: np.ndarray, block: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return twice the log Bayes factor, root (q, r) and posterior mean (r,) of the prior with most evidence."""
+    found = []
+    for root in form.roots():
+        (factor,), (mean,) = compare_groups(np.array([0, root.shape[1]]), root.T @ right, [root.T @ block @ root])
+        found.append((float(factor), root, mean))
+    return max(found, key=lambda one: one[0])
 
 
 # -- linear step ------------------------------------------------------------------------------------------------------
@@ -275,13 +323,14 @@ def propose(
     compare(table)
     model = now.guess.machine(machine)
     seen = [see_run(model, evidence.data, track) for track in tracks]
-    forms = list_forms(evidence, now.judged, seen, effects, has_laws)
+    forms = [f for f in list_forms(evidence, now.judged, seen, effects, has_laws) if f.key not in taken]
     if forms:
         compare(table.with_laws(forms, model, tracks, seen, evidence.map))
         free = [form for form in forms if not form.effect]
         if free:
             leader = max(free, key=lambda form: best[form.key].factor)
-            compare(table.with_laws(list_pairs(evidence, seen, leader), model, tracks, seen, evidence.map))
+            pairs = [form for form in list_pairs(seen, leader) if form.key not in taken]
+            compare(table.with_laws(pairs, model, tracks, seen, evidence.map))
     ranked = sorted(best.values(), key=lambda p: -p.factor)
     single = [p for p in ranked if p.key in chosen]
     if not single:
@@ -304,12 +353,7 @@ def _compare_columns(
             yield index, (version.hypothesis, version.deviation(mean)), float(factor)
     for index, law in enumerate(table.laws):
         right, block = marginal.right[terms.edges[index] : terms.edges[index + 1]], marginal.blocks[index]
-        found = []
-        for root in law.roots():
-            edges = np.array([0, root.shape[1]])
-            (factor,), (mean,) = compare_groups(edges, root.T @ right, [root.T @ block @ root])
-            found.append((float(factor), root, mean))
-        factor, root, mean = max(found, key=lambda one: one[0])
+        factor, root, mean = _best_prior(law, right, block)
         yield index, (law.hypothesis(root), mean), factor
 
 
@@ -434,10 +478,9 @@ def scale_levels(levels: Levels, scale: float) -> Levels:
 def extensions(evidence: Evidence, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
     """Refine the best proposals that the linear step holds for better than the model."""
     better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
-    laws = [p for p in better if p.law]
     chosen = [p for p in better if not p.law][:_TRIED]
-    for is_profile in (False, True):
-        chosen += [p for p in laws if p.law and bool(p.law.effect) == is_profile][:1]
+    laws = {p.law.kind: p for p in reversed(better) if p.law}
+    chosen += laws.values()
     return [m for m in (refine(evidence, now, p) for p in chosen) if m is not None]
 
 

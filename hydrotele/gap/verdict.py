@@ -14,23 +14,22 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
-from hydrotele.estimate.levels import columns_of
-from hydrotele.estimate.track import track_run
-from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, settle_noise
 from hydrotele.gap.result import LIKELY, SURE, LearnedLaw, NamedEffect, Verdict
 
 _AHEAD = 1.0  # s, of open-loop predictions: several correlation times of the residual inputs
 _STEP = 2.0e-3  # s, of their integrator
 _LOST = 1.0e3  # times the noise: larger errors say no more
 _NORMAL95 = 1.645  # quantile of a one-sided test at 95 %
+_REACH95 = 1.96  # standard errors of a 95 % interval
 
 
 class HeldOut(NamedTuple):
     """Two models compared on the held-out run, which neither was fitted to.
 
     Attributes:
-        log_ratio: twice the log ratio of the predictive likelihoods, each with noise levels and residual inputs of its
-            own; positive if the final model is better.
+        log_ratio: twice the log ratio of the predictive likelihoods, each with the noise levels and residual inputs
+            that this run asks for; positive if the final model is better.
         open_loop: mean log ratio of the errors of open-loop predictions over 1 s, final to given model; NaN if the run
             is too short.
         deviation: standard error of that mean.
@@ -50,10 +49,11 @@ class HeldOut(NamedTuple):
         """The comparison in a sentence."""
         text = f"On the held-out run, twice the log likelihood of the changed model is {self.log_ratio:+,.0f} higher"
         if math.isfinite(self.open_loop):
-            change = 100.0 * math.expm1(self.open_loop)
+            middle, reach = self.open_loop, _REACH95 * self.deviation
+            ratio, low, high = (math.exp(x) for x in (middle, middle - reach, middle + reach))
             text += (
-                f", and its open-loop errors over {_AHEAD:g} s change by {change:+.0f} %"
-                f" (standard error {100.0 * self.deviation:.0f} %)"
+                f", and its open-loop errors over {_AHEAD:g} s are {ratio:.2f} times those of the given one"
+                f" (95 % interval {low:.2f} to {high:.2f})"
             )
         return f"{text}." + (" The changes were rejected, and no effect is named." if self.is_worse else "")
 
@@ -69,11 +69,11 @@ def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOu
     run = evidence.data.heldout
 
     def loss(judged: Judged) -> float:
-        machine, levels = judged.guess.machine(evidence.data.machine), judged.tracks[0].levels
-        plain = dataclasses.replace(levels, inputs=(), sizes=np.zeros(0))
-        near = track_run(machine, evidence.data, run, levels=plain, linearise=True)
-        columns = columns_of(machine, near, levels.inputs)
-        return track_run(machine, evidence.data, run, levels=levels, columns=columns, rest=near.rest).loss
+        own = Evidence(evidence.data, (run,), 1, evidence.step, lacking=True)
+        try:
+            return settle_noise(own, own.judged(judged.guess)).loss - judged.guess.prior
+        finally:
+            own.close()
 
     def errors(judged: Judged) -> np.ndarray:
         """Return the log errors of open-loop windows in units of the noise of the given model; at least 0."""
@@ -86,7 +86,8 @@ def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOu
             sizes = np.sqrt(np.nanmean((found.each / given.tracks[0].levels.whole_noise) ** 2, axis=1))
         return np.log(np.clip(sizes, 1.0, _LOST))
 
-    losses, windows = evidence.map(loss, (given, final)), evidence.map(errors, (given, final))
+    losses = [loss(judged) for judged in (given, final)]
+    windows = evidence.map(errors, (given, final))
     change = windows[1] - windows[0]
     change = change[np.isfinite(change)]
     mean = float(change.mean()) if len(change) else math.nan
