@@ -119,9 +119,13 @@ class Dictionary:
             each: `map`, or that of a pool.
         """
 
+        places = {(law.balance, law.axis): law for law in laws}
+        made = each(lambda law: [law.unit_changes(machine, track) for track in tracks], list(places.values()))
+        units = dict(zip(places, made, strict=True))
+
         def of_law(law: LawForm) -> np.ndarray:
-            runs = [law.columns(machine, t, s) for t, s in zip(tracks, seen, strict=True)]
-            return np.concatenate(runs).astype(np.float32)
+            runs = zip(tracks, seen, units[law.balance, law.axis], strict=True)
+            return np.concatenate([law.columns(t, s, unit) for t, s, unit in runs]).astype(np.float32)
 
         columns = tuple(each(of_law, laws))
         return replace(self, versions=(), columns=(), laws=tuple(laws), law_columns=columns)

@@ -142,14 +142,16 @@ def _drives_of(model, sp, states, position, velocity, act, supply):
 
 def see(data: Dataset, judged: Judged, track: Track) -> Seen:
     """A run of a guess by what the smoother of its track says."""
-    return see_run(judged.guess.machine(data.machine), data, track)
+    return see_run(judged.guess.machine(data.machine), data, track, is_smoothed=True)
 
 
-def see_run(machine: Machine, data: Dataset, track: Track) -> Seen:
-    """A run of a machine by what the smoother of its track says."""
+def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = False) -> Seen:
+    """A run of a machine by the states of its filter, which its laws see, or by those of its smoother."""
     size = track.states.shape[1]
     run, told = smoothed(track)
-    states = track.states - run.correction[:, :size] + told.deviation[:, :size]
+    states = track.states
+    if is_smoothed:
+        states = states - run.correction[:, :size] + told.deviation[:, :size]
     model = following_model(machine, data)
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))

@@ -217,13 +217,15 @@ def find_gap(
     named = _named(found, discovery.judged.guess, spread, shares, not is_regression)
     left = left_over(before[0], after[0], data.channels, floor)
     details, method_notes = (), []
+    size = GapSize(rms(before[:1]), rms(after[:1]), floor)
+    unbounded = dataclasses.replace(size, noise_floor=None)  # process noise may stand for what is missing
     if is_regression:
         failed = any(not test["passed"] for test in tests.values())
         named = tuple(
             with_profile(data.machine, effect, varied.get((effect.name, effect.location))) for effect in named
         )
         named = count_unexplained(named, learned, left, _lost(tests, learned, 0.0))
-        verdict = verdict_of_regression(named, learned, failed, None if judge.ripple else floor)
+        verdict = verdict_of_regression(named, learned, failed, unbounded if judge.ripple else size)
         method_notes += [words for effect in named if (words := answer_words(effect))]
         if held_out and not held_out.is_worse:
             method_notes.append(held_out.words)
@@ -258,7 +260,7 @@ def find_gap(
         verdict=verdict,
         effects=named,
         unknown=unknown if verdict != "no_gap" else None,
-        size=GapSize(rms(before[:1]), rms(after[:1]), floor),
+        size=size,
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,

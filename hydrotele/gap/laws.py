@@ -20,10 +20,10 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Evidence, Judged
-from hydrotele.estimate.filter import Input, input_sizes
+from hydrotele.estimate.filter import Input, _rows_later, input_sizes
 from hydrotele.estimate.hypothesis import LEARNED, Hypothesis
-from hydrotele.estimate.levels import columns_of
-from hydrotele.estimate.track import Track, error_responses
+from hydrotele.estimate.reduced_model import model_space, reduced_model
+from hydrotele.estimate.track import STEP, Track, error_responses, steps_per_row
 from hydrotele.gap.description import variable_unit
 from hydrotele.gap.discover import Learned, Seen, see_run
 from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Table
@@ -175,11 +175,29 @@ class LawForm:
             found = found * (form.sign * form.along(values, self.constants))[:, None]
         return np.nan_to_num(found)
 
-    def columns(self, machine: Machine, track: Track, seen: Seen) -> np.ndarray:
-        """Return the change (n c, q) of a track's whitened errors per unit of each function of `basis`."""
-        names = [Input(balance, self.axis) for balance, _ in self.sides]
-        unit = columns_of(machine, track, names)
-        unit = sum(sign * unit[:, k] for k, (_, sign) in enumerate(self.sides))
+    def unit_changes(self, machine: Machine, track: Track) -> np.ndarray:
+        """Return what a unit of the balance, held over a row, changes in the states after it (n, nz)."""
+        step = _TYPICAL * float(input_sizes(machine, [Input(self.sides[0][0], self.axis)])[0])
+        added = [
+            Term(name="unit", axis=self.axis, balance=side, law="constant", parameters={"value": sign * step})
+            for side, sign in self.sides
+        ]  # fmt: skip
+        ends = []
+        for one in (machine, machine.model_copy(update={"terms": (*machine.terms, *added)})):
+            model, later = reduced_model(one, ()), np.empty(track.states.shape)
+            steps = steps_per_row(one, track.run.period, STEP)
+            _rows_later(model, model_space(model), track.states, track.run.command, track.run.period, steps, later)
+            ends.append(later)
+        return np.nan_to_num(ends[1] - ends[0]) / step
+
+    def columns(self, track: Track, seen: Seen, unit: np.ndarray) -> np.ndarray:
+        """Return the change (n c, q) of a track's whitened errors per unit of each function of `basis`.
+
+        Args:
+            track: linearised.
+            seen: its variables.
+            unit: of `unit_changes`, (n, nz).
+        """
         responses = error_responses(track, unit, self.shares(seen) @ self.basis)
         return responses.reshape(-1, responses.shape[2])
 
@@ -236,7 +254,8 @@ class LawHypothesis(Hypothesis):
 
     def responses(self, machine: Machine, data: Dataset, track: Track) -> np.ndarray:
         """Return the change (n c, r) of a track's whitened errors per parameter, see `Hypothesis.responses`."""
-        return self.form.columns(machine, track, see_run(machine, data, track)) @ self.root
+        unit = self.form.unit_changes(machine, track)
+        return self.form.columns(track, see_run(machine, data, track), unit) @ self.root
 
 
 def list_forms(

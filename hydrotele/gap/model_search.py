@@ -551,7 +551,7 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
         proposal: what is added.
 
     Returns:
-        The extended model; None where the machine cannot follow the runs.
+        The extended model; None where the machine cannot follow the runs, or the change is not relevant.
     """
     guess = extend(evidence.data.machine, now.guess, proposal)
     tracks = tuple(scale_residual_inputs(t, proposal.residual_scale) for t in now.judged.tracks)
@@ -561,7 +561,7 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
         if proposal.parameter_scale > 0.0:
             kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE)
         fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
-        if not np.isfinite(fit.loss):
+        if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in fit.guess.parts[len(now.guess.parts) :]):
             return None
         evidence.set_base(now.judged)
         if proposal.residual_scale == 1.0:
@@ -571,6 +571,14 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
     finally:
         evidence.set_base(now.judged)
     return Model(judged, fit, fit.whole_penalty) if np.isfinite(judged.loss) else None
+
+
+def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
+    """Return whether an effect changes every parameter by less than the library states as the smallest relevant change.
+
+    A long log shows a difference of two integrators as a bandwidth that is 0.5 % off.
+    """
+    return bool(np.all(np.abs(deviation) < hypothesis.least))
 
 
 def extend(machine: Machine, guess: Guess, proposal: Proposal) -> Guess:

@@ -14,8 +14,9 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
+from hydrotele.gap.description import gap_closed
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, settle_noise
-from hydrotele.gap.result import LIKELY, SURE, LearnedLaw, NamedEffect, Verdict
+from hydrotele.gap.result import LIKELY, SURE, GapSize, LearnedLaw, NamedEffect, Verdict
 
 _AHEAD = 1.0  # s, of open-loop predictions: several correlation times of the residual inputs
 _STEP = 2.0e-3  # s, of their integrator
@@ -124,18 +125,20 @@ def count_unexplained(
     return tuple(sorted(found, key=lambda effect: -effect.probability))
 
 
-def verdict_of(named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], failed: bool, floor: float | None) -> Verdict:
+def verdict_of(named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], failed: bool, size: GapSize) -> Verdict:
     """Return the verdict.
 
     Args:
         named: the effects.
         laws: learned laws without a known cause.
         failed: whether a residual test of the final model fails.
-        floor: error of a perfect model; None if it is not known.
+        size: of the gap on the held-out run. Laws alone are `learned` if they close `SURE` of it.
     """
     likely = [e for e in named if e.mechanism_probability > LIKELY]
     if not named and not laws:
-        return "unknown" if failed or floor is None else "no_gap"
+        return "unknown" if failed or size.noise_floor is None else "no_gap"
+    if likely and (failed or laws):
+        return "partly"
     if failed or laws:
-        return "partly" if likely else "unknown" if failed else "learned"
+        return "learned" if laws and not named and gap_closed(size) >= SURE else "unknown"
     return "named" if all(e.mechanism_probability >= SURE for e in named) else "ambiguous"
