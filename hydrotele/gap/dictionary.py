@@ -118,7 +118,6 @@ class Dictionary:
             seen: what the smoother says of each.
             each: `map`, or that of a pool.
         """
-
         places = {(law.balance, law.axis): law for law in laws}
         made = each(lambda law: [law.unit_changes(machine, track) for track in tracks], list(places.values()))
         units = dict(zip(places, made, strict=True))

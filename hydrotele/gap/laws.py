@@ -12,7 +12,7 @@ the hat functions. The corrected machine states a group as a term (`hydrotele.te
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import chain, combinations, count
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -299,11 +299,12 @@ def list_forms(
 
 
 def list_pairs(seen: Sequence[Seen], single: LawForm) -> list[LawForm]:
-    """Return the laws over products of two variables at the place of a law over one."""
+    """Return the laws over products of the variable of a law over one with another, at the same place."""
     points = place_knots(seen, single.axis, _KNOTS[2], single.smoothing)
+    (first,) = single.table.variables
     return [
-        LawForm(single.balance, single.axis, Table((a, b), (points[a], points[b])), single.size, single.smoothing)
-        for a, b in combinations(points, 2)
+        replace(single, table=Table((first, other), (points[first], points[other])))
+        for other in points if other != first
     ]  # fmt: skip
 
 

@@ -45,6 +45,7 @@ PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 _OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
 _SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
 _JOINT = 40  # best effects among which a pair is looked for
+_LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
@@ -324,13 +325,17 @@ def propose(
     model = now.guess.machine(machine)
     seen = [see_run(model, evidence.data, track) for track in tracks]
     forms = [f for f in list_forms(evidence, now.judged, seen, effects, has_laws) if f.key not in taken]
-    if forms:
-        compare(table.with_laws(forms, model, tracks, seen, evidence.map))
-        free = [form for form in forms if not form.effect]
-        if free:
-            leader = max(free, key=lambda form: best[form.key].factor)
-            pairs = [form for form in list_pairs(seen, leader) if form.key not in taken]
-            compare(table.with_laws(pairs, model, tracks, seen, evidence.map))
+
+    def compare_laws(laws: Sequence[LawForm]) -> None:
+        for begin in range(0, len(laws), _LAWS_AT_ONCE):
+            part = laws[begin : begin + _LAWS_AT_ONCE]
+            compare(table.with_laws(part, model, tracks, seen, evidence.map))
+
+    compare_laws(forms)
+    free = [form for form in forms if not form.effect]
+    if free:
+        leader = max(free, key=lambda form: best[form.key].factor)
+        compare_laws([form for form in list_pairs(seen, leader) if form.key not in taken])
     ranked = sorted(best.values(), key=lambda p: -p.factor)
     single = [p for p in ranked if p.key in chosen]
     if not single:
