@@ -45,7 +45,7 @@ from hydrotele.simulate.open_loop_prediction import open_loop_errors
 
 _COLOURS = {
     "named": "blue", "partly": "magenta", "no_gap": "green", "ambiguous": "yellow",
-    "unknown": "red",
+    "unknown": "red", "learned": "magenta",
 }  # fmt: skip
 _COLUMNS = ("effect", "parameter", "given model", "estimate", "95 % interval", "unit")
 

@@ -19,7 +19,7 @@ from scipy.optimize import lsq_linear
 from scipy.special import ndtr, ndtri
 
 from hydrotele.estimate.filter import MEMORY
-from hydrotele.estimate.hypothesis import DomainError, Guess
+from hydrotele.estimate.hypothesis import DomainError, Guess, Hypothesis
 from hydrotele.estimate.levels import find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,
@@ -128,6 +128,7 @@ class Evidence:
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
         self._slopes, self._smooth = dict[float, np.ndarray](), dict[float, bool]()
         self._information = list[str](), np.zeros((0, 0))
+        self._responses = dict[int, tuple[Hypothesis, np.ndarray | None]]()
 
     def close(self) -> None:
         """End the workers; what has not begun is dropped."""
@@ -194,7 +195,7 @@ class Evidence:
         """Compute gains anew for a guess; later errors are whitened with them."""
         judged = guess if isinstance(guess, Judged) else self.judged(guess)
         self.tracks, self._base = judged.tracks, judged.guess
-        self._steps, self._slopes, self._smooth = {}, {}, {}
+        self._steps, self._slopes, self._smooth, self._responses = {}, {}, {}, {}
         return judged
 
     @property
@@ -274,8 +275,11 @@ class Evidence:
         both are.
         """
         nudges, machine = guess.nudges(), self.data.machine
+        linear = self._linear_slopes(guess)
 
         def column(index: int) -> np.ndarray:
+            if index in linear:
+                return linear[index]
             for nudge in (nudges[index], -nudges[index]):
                 moved = guess.deviation
                 moved[index] += nudge
@@ -287,6 +291,24 @@ class Evidence:
         columns = range(first, len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
         return np.column_stack(found) if found else np.zeros((len(errors), 0))
+
+    def responses(self, hypothesis: Hypothesis, tracks: Sequence[Track]) -> np.ndarray | None:
+        """Return the change (E, p) of the base's errors per deviation of what is linear, see `Hypothesis.responses`."""
+        machine = self._base.machine(self.data.machine)
+        parts = [hypothesis.responses(machine, self.data, track) for track in tracks]
+        return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
+
+    def _linear_slopes(self, guess: Guess) -> dict[int, np.ndarray]:
+        """Return index -> slope (E,) of the deviations of a guess that need no simulation."""
+        found, first = {}, 0
+        for hypothesis in guess.hypotheses:
+            if id(hypothesis) not in self._responses:
+                self._responses[id(hypothesis)] = hypothesis, self.responses(hypothesis, self.tracks)
+            columns = self._responses[id(hypothesis)][1]
+            if columns is not None:
+                found |= {first + k: column for k, column in enumerate(columns.T)}
+            first += hypothesis.size
+        return found
 
     @property
     def slope_step(self) -> float:
@@ -323,15 +345,21 @@ class Evidence:
         if step not in self._slopes:
             errors = self.errors(self._base, step, parallel=parallel)
             names = self._base.names
-            if len(names) <= _MANY:
+            linear = self._linear_slopes(self._base)
+            if len(names) - len(linear) <= _MANY:
                 self._slopes[step] = self.slopes(self._base, errors, parallel, step)
                 return self._slopes[step]
-            information = self._known_information(names)
+            others = [k for k in range(len(names)) if k not in linear]
+            own = [names[k] for k in others]
+            information = self._known_information(own)
             if information is None:
-                rough = self.slopes(self._base, errors, parallel, step)
-                information = rough.T @ rough + np.eye(len(names))
-            found = self._along(information, errors, parallel, step)
-            self._information = names, found.T @ found + np.eye(len(names))
+                rough = self.slopes(self._base, errors, parallel, step)[:, others]
+                information = rough.T @ rough + np.eye(len(others))
+            found = np.empty((len(errors), len(names)))
+            found[:, others] = self._along(information, errors, parallel, step, others)
+            for k, column in linear.items():
+                found[:, k] = column
+            self._information = own, found[:, others].T @ found[:, others] + np.eye(len(others))
             self._slopes[step] = found
         return self._slopes[step]
 
@@ -350,17 +378,25 @@ class Evidence:
         """Keep what slopes (E, P) tell of a guess: a base of its numbers needs no rough ones."""
         self._information = guess.names, slopes.T @ slopes + np.eye(slopes.shape[1])
 
-    def _along(self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float) -> np.ndarray:
-        """(E, P) slopes of the base from differences along the directions of an information."""
+    def _along(
+        self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float, own: Sequence[int]
+    ) -> np.ndarray:  # fmt: skip
+        """(E, P) slopes of some deviations of the base from differences along the directions of their information."""
         base, sizes, ways = self._base, *np.linalg.eigh(information)
         here = base.deviation
+
+        def moved_by(way: np.ndarray) -> np.ndarray:
+            there = here.copy()
+            there[own] += way
+            return there
+
         moves = (_MOVE / np.sqrt(np.maximum(sizes, 1.0))) * ways  # 1 of the prior; less is rounding
         for way in moves.T:  # to the side where bounds leave more room
-            ahead, back = (base.at(here + s * way).deviation - here for s in (1.0, -1.0))
+            ahead, back = (base.at(moved_by(s * way)).deviation[own] - here[own] for s in (1.0, -1.0))
             way[:] = ahead if ahead @ ahead >= back @ back else back
 
         def change(way: np.ndarray) -> np.ndarray:
-            moved = base.at(here + way)
+            moved = base.at(moved_by(way))
             return self.errors(moved, step) - errors if moved.is_in_domain(self.data.machine) else np.zeros(len(errors))
 
         changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]

@@ -14,6 +14,7 @@ remains after that.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import lateral_directions, nonparallel_cylinder_axes, with_value
 from hydrotele.machine.machine import Machine
+
+if TYPE_CHECKING:
+    from hydrotele.estimate.track import Track
+    from hydrotele.logs.dataset import Dataset
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
 WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes slopes steep
@@ -146,6 +151,18 @@ class Hypothesis:
     def held(self, deviation: np.ndarray) -> "Hypothesis":
         """The same with its numbers fixed at a deviation (p,): none is left to fit."""
         return replace(self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation))
+
+    def responses(self, machine: Machine, data: "Dataset", track: "Track") -> np.ndarray | None:
+        """Return the change (n c, p) of a track's whitened errors per deviation, or None if it must be simulated.
+
+        What adds to a balance in proportion to its deviations has responses that follow from the linearised filter.
+
+        Args:
+            machine: of the track.
+            data: the dataset.
+            track: linearised.
+        """
+        return None
 
     def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
@@ -335,6 +352,8 @@ class Guess:
 
 CALIBRATION = "calibration"
 """Name of the hypothesis that holds all uncertain numbers."""
+LEARNED = "learned"
+"""First part of the name of a hypothesis that holds a learned law."""
 
 # Relative standard deviation of what a data sheet, a drawing or a workshop says.
 UNCERTAINTY: dict[str, float] = {

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hydrotele.effects import EFFECTS
-from hydrotele.gap.result import SURE, NamedEffect
+from hydrotele.gap.result import SURE, VARIES, NamedEffect
 
 LEVELS = ("place", "family", "law")
 """The levels of an answer, from the first to the deepest."""
@@ -32,12 +32,21 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
 """Family -> names of effects, where the part of the model that an effect changes is not its family."""
 
 
+def base_effect(name: str) -> str:
+    """Return the library effect of an effect whose coefficient varies (`EFFECT_by_VARIABLE`), or the name itself."""
+    base = name.partition(VARIES)[0]
+    return base if base in EFFECTS else name
+
+
 def family_of(name: str) -> str:
     """Return the family of an effect: one of `FAMILIES`, else the part of the model that it changes.
 
-    >>> family_of("coulomb_friction"), family_of("angle_offset"), family_of("valve_deadband")
+    A coefficient that varies is of the same family; a learned law is none of a library effect.
+
+    >>> family_of("coulomb_friction_by_position"), family_of("angle_offset"), family_of("valve_deadband")
     ('friction', 'sensor', 'valve')
     """
+    name = base_effect(name)
     for family, names in FAMILIES.items():
         if name in names:
             return family

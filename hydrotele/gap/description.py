@@ -10,6 +10,7 @@ import numpy as np
 
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.filter import SUPPLY, Input, input_units
+from hydrotele.gap.answer import base_effect
 from hydrotele.gap.discover import Discovery, Learned
 from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
 from hydrotele.gap.result import (
@@ -265,6 +266,8 @@ def headline(gap: Gap) -> str:
     if gap.verdict == "partly":
         remainder = "the remaining difference has no known cause"
         return _capital("; ".join([*map(_brief, gap.effects), remainder]))
+    if gap.verdict == "learned":
+        return f"Model and machine differ; {_closing_changes(gap)}, but the cause is not in the library"
     if gap.verdict == "unknown" or not gap.effects:
         likely = (e for e in gap.effects if e.mechanism_probability > LIKELY)
         known = " and ".join(map(effect_title, likely))
@@ -288,7 +291,13 @@ def _closing_changes(gap: Gap) -> str:
     what = ["learned laws"] * bool(gap.learned) + ["calibrated parameters"] * bool(gap.calibration)
     if not what or not closed > _UNSEEN:
         return ""
-    return f"{_listed(what, 'and')} close {100 * closed:.0f} % of the gap"
+    return f"{_listed(what, 'and')} close {_closed_words(gap)} of the gap"
+
+
+def _closed_words(gap: Gap) -> str:
+    """Fraction of the gap that is closed; never 100 % if a residual test says that something remains."""
+    percent = 100.0 * max(gap_closed(gap.size), 0.0)
+    return f"{min(math.floor(percent), 99) if failed_tests(gap) else percent:.0f} %"
 
 
 def verdict_words(gap: Gap) -> tuple[str, ...]:
@@ -296,7 +305,7 @@ def verdict_words(gap: Gap) -> tuple[str, ...]:
     if gap.verdict == "no_gap":
         rest = _calibrated(gap) or ("The model needs no change.",)
         return (_agreement(gap), *rest)
-    if gap.verdict == "unknown":
+    if gap.verdict in ("unknown", "learned"):
         return (
             *_unknown(gap), *_effects(gap), *_calibrated(gap), *_shrinking(gap), *_experiment(gap)
         )  # fmt: skip
@@ -335,14 +344,29 @@ def _effects(gap: Gap) -> tuple[str, ...]:
 
 def _effect(effect: NamedEffect, run: str) -> str:
     facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
-    known = EFFECTS.get(effect.name)
+    known = EFFECTS.get(base_effect(effect.name))
     what = f"{effect_title(effect)} ({known.description})" if known else effect_title(effect)
+    if effect.profile:
+        facts = f"{profile_words(effect)}; mean {facts}"
     text = _capital(f"{what}: {facts}. Probability {probability_text(effect.probability)}.")
     if effect.share < _UNSEEN:
         return f"{text} This holds for the fitted runs; {run} does not show it, its predictions are as good without it."
     if math.isfinite(effect.share):
         text += f" Without it, {share_words(effect.share)} of the gap on {run} reappears."
     return text
+
+
+def profile_words(effect: NamedEffect) -> str:
+    """How the coefficient of an effect varies: its range, and where it is largest."""
+    profile = effect.profile
+    assert profile
+    ((key, estimate),) = effect.parameters.items()
+    least, most = min(profile.values), max(profile.values)
+    where = amount(profile.points[profile.values.index(most)], profile.variable_unit)
+    return (
+        f"{key.replace('_', ' ')} between {amount(least, estimate.unit, key)} and {amount(most, estimate.unit, key)},"
+        f" largest at a {variable_words(profile.variable)} of {where}"
+    )
 
 
 def _calibrated(gap: Gap) -> tuple[str, ...]:
@@ -374,7 +398,7 @@ def _agreement(gap: Gap) -> str:
 
 
 def _shrinking(gap: Gap) -> tuple[str, ...]:
-    size, closed = gap.size, gap_closed(gap.size)
+    size = gap.size
     parts = len(gap.effects) + len(gap.learned) + bool(gap.calibration)
     if not parts:
         return ()
@@ -387,7 +411,7 @@ def _shrinking(gap: Gap) -> tuple[str, ...]:
         return (f"{text}.",)
     if size.before - size.noise_floor < _SLIGHT:
         return (f"{text}. The effect is weak: it hardly changes the predictions of this run.",)
-    return (f"{text}: {100 * max(closed, 0.0):.0f} % of the gap is closed.",)
+    return (f"{text}: {_closed_words(gap)} of the gap is closed.",)
 
 
 def _times(value: float, size: GapSize) -> str:
@@ -521,7 +545,7 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
     when = "from {:.3g} to {:.3g} s".format(*table.window) if table.window else ""
     memory = ""
     if table.memory:
-        memory = memory_words(table.memory, _variable_unit(machine, law, table.memory.variable))
+        memory = memory_words(table.memory, variable_unit(machine, law.axis, table.memory.variable))
         when = " and ".join([memory, *([when] if when else [])])
     size = float(np.sqrt(np.mean(along**2)))
     if law.balance == SUPPLY:
@@ -532,7 +556,7 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
             law.balance, law.axis, variable, size, unit, resembles, other, when
         ),
         resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
-        tuple(error.tolist()), unit, _variable_unit(machine, law, variable), share, other, memory,
+        tuple(error.tolist()), unit, variable_unit(machine, law.axis, variable), share, other, memory,
     )  # fmt: skip
 
 
@@ -567,10 +591,10 @@ def _turns(machine: Machine, axis: str) -> bool:
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
 
 
-def _variable_unit(machine: Machine, law: Learned, variable: str) -> str:
-    """SI unit of a law's variable."""
+def variable_unit(machine: Machine, own_axis: str, variable: str) -> str:
+    """SI unit of a law's variable; `own_axis` is that of the law."""
     name, _, axis = variable.removeprefix(_PLAYED).removeprefix(_AHEAD).partition(".")
-    length = "rad" if _turns(machine, axis or law.axis) else "m"
+    length = "rad" if _turns(machine, axis or own_axis) else "m"
     if name == "force":
         return "N m" if length == "rad" else "N"
     return _UNITS.get(name) or (f"{length}/s" if name == "velocity" else length)

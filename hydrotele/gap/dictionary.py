@@ -5,7 +5,7 @@ relief valve that opens earlier, friction that holds) has a different version at
 averages over them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,9 @@ import numpy as np
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.track import COARSE, Track
+from hydrotele.gap.discover import Seen
+from hydrotele.gap.laws import LawForm
+from hydrotele.machine.machine import Machine
 
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one
@@ -87,17 +90,44 @@ class Dictionary:
         columns: per version (E, q) change of the whitened errors per prior standard deviation.
         nuisance: (E, K) the same of the model's own and of the uncertain parameters.
         own: (K,) whether a nuisance column is a parameter of the model itself.
+        laws: L laws and profiles.
+        law_columns: per law (E, q) change of the whitened errors per unit of each function of its basis.
     """
 
     versions: tuple[Version, ...]
     columns: tuple[np.ndarray, ...]
     nuisance: np.ndarray
     own: np.ndarray
+    laws: tuple[LawForm, ...] = ()
+    law_columns: tuple[np.ndarray, ...] = ()
 
     def select(self, indices: Sequence[int]) -> "Dictionary":
         """Return a dictionary of some versions."""
         versions = tuple(self.versions[i] for i in indices)
-        return replace(self, versions=versions, columns=tuple(self.columns[i] for i in indices))
+        columns = tuple(self.columns[i] for i in indices)
+        return replace(self, versions=versions, columns=columns, laws=(), law_columns=())
+
+    def with_laws(self, laws: Sequence[LawForm], machine: Machine, tracks: Sequence[Track], seen: Sequence[Seen],
+                  each: Callable) -> "Dictionary":  # fmt: skip
+        """Return a dictionary of laws instead of versions.
+
+        Args:
+            laws: L laws.
+            machine: the model.
+            tracks: as of `build_dictionary`.
+            seen: what the smoother says of each.
+            each: `map`, or that of a pool.
+        """
+        places = {(law.balance, law.axis): law for law in laws}
+        made = each(lambda law: [law.unit_changes(machine, track) for track in tracks], list(places.values()))
+        units = dict(zip(places, made, strict=True))
+
+        def of_law(law: LawForm) -> np.ndarray:
+            runs = zip(tracks, seen, units[law.balance, law.axis], strict=True)
+            return np.concatenate([law.columns(t, s, unit) for t, s, unit in runs]).astype(np.float32)
+
+        columns = tuple(each(of_law, laws))
+        return replace(self, versions=(), columns=(), laws=tuple(laws), law_columns=columns)
 
 
 def build_dictionary(
@@ -125,12 +155,20 @@ def build_dictionary(
         return np.column_stack([difference(guess.plus(version.hypothesis, s), a) for s, a in columns])
 
     def of_parameter(index: int) -> np.ndarray:
+        if index in linear:
+            return linear[index].astype(np.float32)
         moved = whole.deviation
         moved[index] += nudges[index]
         return difference(whole.at(moved), nudges[index])
 
     whole = guess.plus(uncertain, np.zeros(uncertain.size)) if uncertain.size else guess
     nudges = whole.nudges()
+    linear, first = dict[int, np.ndarray](), 0
+    for hypothesis in guess.hypotheses:
+        responses = evidence.responses(hypothesis, tracks)
+        if responses is not None:
+            linear |= {first + k: column for k, column in enumerate(responses.T)}
+        first += hypothesis.size
     nuisance = evidence.map(of_parameter, range(len(nudges)))
     columns = evidence.map(of_version, versions)
     valid = [k for k, c in enumerate(columns) if np.isfinite(c).all() and np.any(c)]

@@ -23,7 +23,7 @@ from hydrotele.core.compiled import compiled
 from hydrotele.estimate.evidence import Evidence, Judged, flat
 from hydrotele.estimate.filter import SUPPLY, Input, input_sizes
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
+from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED, Guess, Hypothesis
 from hydrotele.estimate.levels import columns_of, smoothed, smoothed_inputs
 from hydrotele.estimate.reduced_model import X, model_space, place, supply_of
 from hydrotele.estimate.track import Track, error_responses, following_model
@@ -52,8 +52,6 @@ from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.term import DRIVE_VARIABLES, Term
 
-LEARNED = "learned"
-"""First part of the name of a hypothesis that holds a learned law."""
 _LARGEST = 4  # unknown inputs in whose places laws are looked for
 _COUPLED = 2  # of these, for which variables of other drives are paired, too
 _SINGLES = 6  # tables over one variable that are looked at closely, for each lack
@@ -89,6 +87,7 @@ class Learned:
         charge: what its entries cost, of -2 log likelihood.
         smoothing: of the sign of the velocity [m/s] or [rad/s].
         seen: variable -> values along the fit runs.
+        form_of: library effect whose coefficient it is; empty of a law without a known cause.
     """
 
     hypothesis: Hypothesis
@@ -101,6 +100,8 @@ class Learned:
     charge: float
     smoothing: float
     seen: Mapping[str, np.ndarray] = field(repr=False)
+
+    form_of: str = ""
 
     @property
     def kind(self) -> tuple:
@@ -141,10 +142,16 @@ def _drives_of(model, sp, states, position, velocity, act, supply):
 
 def see(data: Dataset, judged: Judged, track: Track) -> Seen:
     """A run of a guess by what the smoother of its track says."""
-    machine = judged.guess.machine(data.machine)
+    return see_run(judged.guess.machine(data.machine), data, track, is_smoothed=True)
+
+
+def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = False) -> Seen:
+    """A run of a machine by the states of its filter, which its laws see, or by those of its smoother."""
     size = track.states.shape[1]
     run, told = smoothed(track)
-    states = track.states - run.correction[:, :size] + told.deviation[:, :size]
+    states = track.states
+    if is_smoothed:
+        states = states - run.correction[:, :size] + told.deviation[:, :size]
     model = following_model(machine, data)
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Judged
 from hydrotele.estimate.filter import MEMORY, _rows_later, input_sizes, input_units
-from hydrotele.estimate.hypothesis import CALIBRATION
+from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
 from hydrotele.estimate.track import COARSE, Track, steps_per_row
 from hydrotele.gap.discover import see
@@ -81,7 +81,7 @@ def list_rejections(
     rejections = []
     kept = {(e.name, e.location) for e in (*named, *details)}
     for (hypothesis, _), rest in zip(found.guess.parts, found.without, strict=True):
-        if rest is not None and hypothesis.key not in kept:
+        if rest is not None and hypothesis.key not in kept and not hypothesis.name.startswith(LEARNED):
             taken = part_taken(rest, found.judged)
             test = "fraction of the residual inputs' loss that it removes"
             rejections.append(Rejection(*hypothesis.key, test, taken, math.nan))

@@ -12,7 +12,7 @@ from hydrotele.effects.effect import with_value
 from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import Evidence, Judged, posterior_covariance
 from hydrotele.estimate.filter import input_sizes, input_units
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses, limit_to_domain
+from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED, Guess, Hypothesis, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import rippled, stated_jitter
 from hydrotele.estimate.track import STEP, Levels, Track, known_levels, track_run
 from hydrotele.gap.answer import answer_document, answer_words
@@ -23,15 +23,15 @@ from hydrotele.gap.calibrating import (
     fit_until_settled,
 )
 from hydrotele.gap.description import describe, effect_title, learned_laws
-from hydrotele.gap.discover import LEARNED, Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
+from hydrotele.gap.discover import Discovery, Learned, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
+from hydrotele.gap.laws import learned_of, with_profile
 from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
 from hydrotele.gap.posterior import Posterior, sample_posterior
-from hydrotele.gap.profiles import find_profiles, profile_words
 from hydrotele.gap.residuals import (
     believed,
     believed_part,
@@ -60,6 +60,8 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
+from hydrotele.gap.verdict import compare_held_out, count_unexplained
+from hydrotele.gap.verdict import verdict_of as verdict_of_regression
 from hydrotele.logs.dataset import Dataset
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
 from hydrotele.machine.log_channels import parse_channel
@@ -123,6 +125,7 @@ def find_gap(
         CannotFollowError: the filter of the given machine cannot follow the readings.
         InputError: a custom effect allows no value, or its file raised an error.
     """
+    is_regression = method == "regression"
     begin = time.perf_counter()
     report = progress or (lambda text, share: None)
     given, notes = data.machine, []
@@ -140,7 +143,7 @@ def find_gap(
     initial = run_initial_regressions(data)
     for gross in initial.errors:
         warn(gross.description)
-    if method == "regression":
+    if is_regression:
         candidates = with_start_values(candidates, initial)
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     interim = keep_better(data.machine, keep, begin) if keep else lambda judged: None
@@ -156,12 +159,20 @@ def find_gap(
 
     evidence.keep = keep_best
     try:
-        if method == "regression":
-            found = search_model(MachineModel(evidence), candidates, tell)
+        if is_regression:
+            found = search_model(MachineModel(evidence), candidates, tell, has_laws=not effects)
         else:
             found = search(evidence, candidates, tell)
-        discovery = Discovery(found.judged, ())
-        if lacking(found.judged, evidence) > 0.0 and not effects:
+        discovery, held_out = Discovery(found.judged, ()), None
+        if is_regression and found.guess.parts:
+            tell("compare with the given machine on the held-out run", 0.94)
+            held_out = compare_held_out(evidence, found.base, found.judged)
+            if held_out.is_worse:
+                notes.append(held_out.words)
+                found = found.emptied()
+                keep_best(evidence.set_base(found.base))
+                discovery = Discovery(found.judged, ())
+        elif not is_regression and lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
                 notes.append(_REJECTED.format(worse))
                 found = found.emptied()
@@ -173,7 +184,7 @@ def find_gap(
                 notes.append(_REFUSED)
         tell("evaluate on the held-out run", 0.96)
         outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
-        if outcome.worse:
+        if outcome.worse and not is_regression:
             if (note := _REJECTED.format(outcome.worse)) not in notes:
                 notes.append(note)
             misleading, found = bool(found.guess.parts), found.emptied()
@@ -194,27 +205,41 @@ def find_gap(
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         covariance = posterior_covariance(evidence, told.guess, scatter)
+        varied: dict[tuple[str, str], Learned] = {}
+        if is_regression:
+            laws = learned_of(evidence, told, covariance)
+            discovery = dataclasses.replace(discovery, laws=tuple(law for law in laws if not law.form_of))
+            varied = {law.hypothesis.key: law for law in laws if law.form_of}
         spread = np.sqrt(np.diag(covariance))
-        method_notes = []
-        if method == "regression":
-            method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
         traces = trace_inputs(evidence.data, found.base, discovery.judged)
     finally:
         evidence.close()
-    failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
     learned = learned_laws(discovery, nominal, shares)
-    failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
-    named = _named(found, discovery.judged.guess, spread, shares)
-    if failed:
-        left = left_over(before[0], after[0], data.channels, floor)
-        named = believed(named, learned, left, _lost(tests, learned))
-    lacks = _lacks(data.machine, discovery.judged)
-    perfect = not (failed or learned or lacks)
-    named, details = without_details(named, failed, data.machine.axes, perfect)
-    if method == "regression":
+    named = _named(found, discovery.judged.guess, spread, shares, not is_regression)
+    left = left_over(before[0], after[0], data.channels, floor)
+    details, method_notes = (), []
+    size = GapSize(rms(before[:1]), rms(after[:1]), floor)
+    unbounded = dataclasses.replace(size, noise_floor=None)  # process noise may stand for what is missing
+    if is_regression:
+        failed = any(not test["passed"] for test in tests.values())
+        named = tuple(
+            with_profile(data.machine, effect, varied.get((effect.name, effect.location))) for effect in named
+        )
+        named = count_unexplained(named, learned, left, _lost(tests, learned, 0.0))
+        verdict = verdict_of_regression(named, learned, failed, unbounded if judge.ripple else size)
         method_notes += [words for effect in named if (words := answer_words(effect))]
-    verdict = verdict_of(named, failed, None if judge.ripple else floor)
+        if held_out and not held_out.is_worse:
+            method_notes.append(held_out.words)
+    else:
+        failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
+        failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
+        if failed:
+            named = believed(named, learned, left, _lost(tests, learned, _MINOR))
+        perfect = not (failed or learned or _lacks(data.machine, discovery.judged))
+        named, details = without_details(named, failed, data.machine.axes, perfect)
+        verdict = verdict_of(named, failed, None if judge.ripple else floor)
+    lacks = _lacks(data.machine, discovery.judged)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
     unknown = None
@@ -237,7 +262,7 @@ def find_gap(
         verdict=verdict,
         effects=named,
         unknown=unknown if verdict != "no_gap" else None,
-        size=GapSize(rms(before[:1]), rms(after[:1]), floor),
+        size=size,
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
@@ -265,7 +290,7 @@ def find_gap(
             compare_contenders(found, named),
             list_rejections(
                 found, named, details, _MINOR, [n for n in notes if "rejected" in n],
-                MIN_LOG_BAYES_FACTOR if method == "regression" else ENTER,
+                MIN_LOG_BAYES_FACTOR if is_regression else ENTER,
             ),
             traces,
         ),
@@ -429,12 +454,15 @@ def _failed(tests: Mapping, before: float, after: float, floor: float | None) ->
     return not (excess < _TRACE and closed > _NEARLY_ALL)
 
 
-def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw]) -> set[str]:
-    """Axes in whose channels something is lacking still, "" for a channel without axis."""
+def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw], least: float) -> set[str]:
+    """Axes in whose channels something is lacking still, "" for a channel without axis.
+
+    Laws count that close more than the share `least`.
+    """
     channels = [t["channel"] for name, t in tests.items()
                 if not t["passed"] and name != "constancy"]  # fmt: skip
     axes = {parse_channel(channel).axis or "" for channel in channels}
-    return axes | {law.axis for law in laws if law.share > _MINOR}
+    return axes | {law.axis for law in laws if law.share > least}
 
 
 def verdict_of(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
@@ -459,17 +487,22 @@ def verdict_of(named: Sequence[NamedEffect], failed: bool, floor: float | None) 
     return "partly" if closed >= PARTLY else "unknown"
 
 
-def _named(found: Found, last: Guess, spread: np.ndarray, shares: Mapping) -> tuple[NamedEffect, ...]:
-    """Effects of a search, with their numbers in the last guess, which may have learned laws."""
+def _named(
+    found: Found, last: Guess, spread: np.ndarray, shares: Mapping, has_trust: bool
+) -> tuple[NamedEffect, ...]:  # fmt: skip
+    """Effects of a search, with their numbers in the last guess, which may have learned laws.
+
+    With `has_trust` their probabilities count how much of what was lacking they take.
+    """
     effects, first = [], 0
     for index, (hypothesis, deviation) in enumerate(last.parts[: len(found.guess.parts)]):
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
         rest = found.without[index]
-        if hypothesis.name == CALIBRATION or rest is None:
+        if hypothesis.name == CALIBRATION or hypothesis.name.startswith(LEARNED) or rest is None:
             continue
         chance, others = _chances(found, index, rest)
-        trust = _trust(found, rest)
+        trust = _trust(found, rest) if has_trust else 1.0
         chance *= trust
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(

@@ -5,7 +5,7 @@ Two models implement it: `gap.machine_model` for the reduced model of a hydrauli
 `docs/gap_method.md` states the objective that both evaluate.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +13,9 @@ import numpy as np
 from hydrotele.estimate.evidence import Fit, Judged
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.dictionary import Version
+from hydrotele.gap.laws import LawForm
 from hydrotele.gap.regression import NormalEquations
+from hydrotele.gap.run_differences import Quantity
 
 
 class Linearisation(Protocol):
@@ -30,12 +32,34 @@ class Linearisation(Protocol):
         ...
 
     @property
+    def laws(self) -> Sequence[LawForm]:
+        """The laws and profiles, instead of versions."""
+        ...
+
+    @property
+    def parameters(self) -> Sequence[tuple[str, float]]:
+        """Name and prior standard deviation [SI] of each nuisance column (K,)."""
+        ...
+
+    @property
     def fraction(self) -> float:
         """Fraction of the rows that the columns hold."""
         ...
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[NormalEquations, float]:
-        """Return the normal equations with scaled residual inputs, and -2 log likelihood of the errors.
+    def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
+        """Return profiles of effects, and laws over one variable, that may explain the residual inputs of a model."""
+        return []
+
+    def list_pairs(self, single: LawForm) -> list[LawForm]:
+        """Return the laws over products of the variable of a law with another one."""
+        return []
+
+    def with_laws(self, laws: Sequence[LawForm]) -> "Linearisation":
+        """Return the linearisation of laws instead of versions."""
+        ...
+
+    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
+        """Return per run the normal equations with scaled residual inputs, and -2 log likelihood of all errors.
 
         Args:
             residual_scale: factor on the standard deviations of the residual inputs.
@@ -56,6 +80,9 @@ class GapModel(Protocol):
 
     max_effects: int
     """Number of rounds after which a search ends."""
+
+    run_names: tuple[str, ...]
+    """Names of the fitted runs, and the held-out one last."""
 
     def prepare(self, candidates: Sequence[Hypothesis], given: Judged) -> list[Hypothesis]:
         """Return the candidates with start values that the residual inputs of the given model suggest."""
@@ -119,3 +146,26 @@ class GapModel(Protocol):
     def compare_noise(self, judged: Judged, min_gain: float) -> Judged:
         """Find the coloured noise of the base again; return the model with the most evidence, which is the base."""
         ...
+
+    def list_quantities(self, candidates: Sequence[Hypothesis]) -> Mapping[str, Quantity]:
+        """Return the parameters that may differ between runs."""
+        return {}
+
+    def compare_disturbances(
+        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        """Compare forces that act for a while or periodically with none.
+
+        Args:
+            judged: the base.
+            candidates: effects, among them those that act for a while.
+            scales: factors on the residual inputs.
+
+        Returns:
+            Per disturbance and scale the effect with its deviation (p,), twice its log Bayes factor, and the scale.
+        """
+        return []
+
+    def select_priors(self, guess: Guess) -> Guess:
+        """Select the prior of every learned law and profile of the base by its evidence."""
+        return guess

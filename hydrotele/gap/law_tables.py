@@ -30,7 +30,7 @@ _TIMES = 10  # over time: what acts for a while begins and ends somewhere
 _STEEP = 0.3  # precision of first differences, in units of the lack: beyond what the data tell a
 # law goes on as it is there, not as steeply as it was
 _SHRINK = 0.1  # precision of an entry, in units of the lack: what no data tells is nothing
-_OWN = (
+OWN_VARIABLES = (
     "velocity", "position", "command", "force", "pressure_head", "pressure_rod", "spool",
     "pump_speed", "pressure_supply", "time",
 )  # fmt: skip
@@ -324,7 +324,7 @@ def finer_memories(table: Table, step: float) -> list[Table]:
 
 def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     others = [n for n in values[0] if "." in n and n.partition(".")[0] in DRIVE_VARIABLES]
-    return [n for n in (*_OWN, *others) if n in values[0]]
+    return [n for n in (*OWN_VARIABLES, *others) if n in values[0]]
 
 
 def _points(

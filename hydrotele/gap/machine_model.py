@@ -1,8 +1,9 @@
 """The reduced model of a hydraulic machine in a Kalman filter, as `gap.gap_model.GapModel`."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,8 +15,14 @@ from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
-from hydrotele.gap.regression import NormalEquations, reweight_columns
+from hydrotele.gap.discover import Seen, see_run
+from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
+from hydrotele.gap.gap_model import GapModel, Linearisation
+from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs
+from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
+from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
 from hydrotele.gap.screening import timed
+from hydrotele.machine.machine import Machine
 
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
 _REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distance
@@ -23,7 +30,7 @@ _SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses 
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 
 
-class MachineModel:
+class MachineModel(GapModel):
     """Evidence on the runs of a hydraulic machine, see `gap.gap_model.GapModel`."""
 
     max_effects = _MAX_EFFECTS
@@ -31,6 +38,7 @@ class MachineModel:
     def __init__(self, evidence: Evidence) -> None:
         """Take the evidence, with noise levels that it estimates."""
         self.evidence = evidence
+        self.run_names = tuple(run.name for run in (*evidence.data.fit, evidence.data.heldout))
         self.keep: Callable[[Judged], None] = lambda judged: evidence.keep(judged)
 
     def prepare(self, candidates: Sequence[Hypothesis], given: Judged) -> list[Hypothesis]:
@@ -59,7 +67,7 @@ class MachineModel:
 
     def settle(self, judged: Judged) -> tuple[Judged, Fit]:
         """Alternate fits and estimates of the noise levels."""
-        return fit_until_settled(self.evidence, judged)
+        return rescale_between_runs(*fit_until_settled(self.evidence, judged), self.evidence.runs)
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension on the nonlinear filter and re-estimate its noise levels."""
@@ -69,7 +77,7 @@ class MachineModel:
         try:
             kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE) if dense else None
             fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
-            if not np.isfinite(fit.loss):
+            if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in fit.guess.parts[len(now.guess.parts) :]):
                 return None
             evidence.set_base(now)
             if residual_scale == 1.0:
@@ -78,14 +86,51 @@ class MachineModel:
                 judged = evidence.judged_from(fit.guess, tracks[0].levels)
         finally:
             evidence.set_base(now)
-        return (judged, fit) if np.isfinite(judged.loss) else None
+        return rescale_between_runs(judged, fit, evidence.runs) if np.isfinite(judged.loss) else None
 
     def linearise(self, guess: Guess, versions: Sequence[Version], uncertain: Hypothesis) -> "FilterLinearisation":
         """Compute columns in the first seconds of each run."""
         tracks = [_first_seconds(track) for track in self.evidence.tracks]
         table = build_dictionary(self.evidence, guess, versions, uncertain, tracks)
         rows = sum(len(t.whitened) for t in self.evidence.tracks)
-        return FilterLinearisation(self.evidence, tracks, table, sum(len(t.whitened) for t in tracks) / rows)
+        machine = guess.machine(self.evidence.data.machine)
+        return FilterLinearisation(self.evidence, machine, tracks, table, sum(len(t.whitened) for t in tracks) / rows)
+
+    def list_quantities(self, candidates: Sequence[Hypothesis]) -> Mapping[str, Quantity]:
+        """Return uncertain parameters, and those of effects with one."""
+        return list_quantities(self.evidence.data.machine, candidates)
+
+    def compare_disturbances(
+        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        """Compare them on all rows of the runs."""
+        evidence, taken = self.evidence, {h.key for h in judged.guess.hypotheses}
+        tried = [h for h in list_disturbances(evidence.data, candidates, judged) if h.key not in taken]
+        found = []
+        for scale in scales if tried else ():
+            tracks = evidence.map(lambda track, rho=scale: scale_residual_inputs(track, rho), evidence.tracks)
+            gained = sum(old.loss - new.loss for old, new in zip(evidence.tracks, tracks, strict=True))
+            found += [(part, gained + f, scale) for part, f in compare_disturbances(tried, tracks, evidence.map)]
+        return found
+
+    def select_priors(self, guess: Guess) -> Guess:
+        """Select priors in the linearised model of all rows."""
+        evidence = self.evidence
+        parts, slopes, first = list(guess.parts), evidence.base_slopes(evidence.slope_step), 0
+        for index, (hypothesis, deviation) in enumerate(guess.parts):
+            own = slice(first, first + hypothesis.size)
+            first += hypothesis.size
+            if not isinstance(hypothesis, LawHypothesis):
+                continue
+            form = hypothesis.form
+            columns = evidence.responses(form.hypothesis(np.eye(form.basis.shape[1])), evidence.tracks)
+            assert columns is not None
+            target = columns @ (hypothesis.root @ deviation) - evidence.base_errors
+            others = np.delete(slopes, own, axis=1)
+            marginal = NormalEquations.of(target, [columns], others).marginalise(np.full(others.shape[1], OWN_SCALE))
+            _, root, mean = best_prior(form, marginal.right, marginal.blocks[0])
+            parts[index] = form.hypothesis(root), mean
+        return Guess(tuple(parts))
 
     def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:
         """Propose coloured noise from the spectra of the smoothed noise."""
@@ -132,11 +177,20 @@ class MachineModel:
         return evidence.set_base(min(found, key=charged))
 
 
+def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
+    """Return whether an effect changes every parameter by less than the library states as the smallest relevant change.
+
+    A long log shows a difference of two integrators as a bandwidth that is 0.5 % off.
+    """
+    return bool(np.all(np.abs(deviation) < hypothesis.least))
+
+
 @dataclass(frozen=True)
-class FilterLinearisation:
+class FilterLinearisation(Linearisation):
     """Columns of the linearised filter, see `gap.gap_model.Linearisation`."""
 
     evidence: Evidence
+    machine: Machine
     tracks: Sequence[Track]
     table: Dictionary
     fraction: float
@@ -151,18 +205,47 @@ class FilterLinearisation:
         """Return (K,) whether a nuisance column is a parameter of the model."""
         return self.table.own
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[NormalEquations, float]:
+    @property
+    def laws(self) -> Sequence[LawForm]:
+        """The laws of the dictionary."""
+        return self.table.laws
+
+    @property
+    def parameters(self) -> Sequence[tuple[str, float]]:
+        """Name and prior standard deviation of each nuisance column."""
+        return self.table.parameters
+
+    @cached_property
+    def seen(self) -> list[Seen]:
+        """What the smoother says of each run."""
+        return [see_run(self.machine, self.evidence.data, track) for track in self.tracks]
+
+    def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
+        """Return laws of the balances with residual inputs."""
+        return list_forms(self.evidence, judged, self.seen, effects, has_laws)
+
+    def list_pairs(self, single: LawForm) -> list[LawForm]:
+        """Return products with the other variables of the drive."""
+        return list_pairs(self.seen, single)
+
+    def with_laws(self, laws: Sequence[LawForm]) -> "FilterLinearisation":
+        """Return the same with the columns of laws."""
+        table = self.table.with_laws(laws, self.machine, self.tracks, self.seen, self.evidence.map)
+        return dataclasses.replace(self, table=table)
+
+    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Run the filter again on its own linearisation with the residual inputs scaled."""
         tracks, table = self.tracks, self.table
+        groups = table.law_columns if table.laws else table.columns
         if joined:
-            table = dataclasses.replace(table, columns=(np.hstack([table.columns[g] for g in joined]),))
+            groups = (np.hstack([groups[g] for g in joined]),)
         edges = np.cumsum([0, *(t.whitened.size for t in tracks)])
-        widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
+        widths = np.cumsum([0, *(c.shape[1] for c in groups), table.nuisance.shape[1]])
 
         def of_run(index: int) -> tuple[NormalEquations, float]:
             track, rows = tracks[index], slice(edges[index], edges[index + 1])
             scaled = scale_residual_inputs(track, residual_scale)
-            columns = np.hstack([*(c[rows] for c in table.columns), table.nuisance[rows]]).astype(float)
+            columns = np.hstack([*(c[rows] for c in groups), table.nuisance[rows]]).astype(float)
             missing = ~np.isfinite(track.whitened)
             if residual_scale != 1.0:
                 there = columns.reshape(*track.whitened.shape, -1)
@@ -171,15 +254,12 @@ class FilterLinearisation:
                     track.gains.slope, track.flow, missing, track.gains.gain, scaled.gains.gain, there,
                 )  # fmt: skip
                 there /= np.where(missing, 1.0, scaled.gains.spread)[:, :, None]
-            groups = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
+            parts = [columns[:, a:b] for a, b in zip(widths[:-2], widths[1:-1], strict=True)]
             errors = -np.nan_to_num(scaled.whitened).ravel()
-            return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
+            return NormalEquations.of(errors, parts, columns[:, widths[-2] :]), scaled.loss
 
         found = self.evidence.map(of_run, range(len(tracks)))
-        terms = found[0][0]
-        for other, _ in found[1:]:
-            terms = terms + other
-        return terms, sum(loss for _, loss in found)
+        return [terms for terms, _ in found], sum(loss for _, loss in found)
 
 
 def _first_seconds(track: Track) -> Track:

@@ -10,7 +10,7 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 4. Remove every effect whose removal costs less than that; exchange an effect for a better rival.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,10 +19,20 @@ from hydrotele.estimate.evidence import Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.dictionary import list_versions
+from hydrotele.gap.disturbances import acts_for_a_while
 from hydrotele.gap.gap_model import GapModel, Linearisation
-from hydrotele.gap.regression import compare_groups, sum_of_single_effects
+from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior
+from hydrotele.gap.regression import (
+    OWN_SCALE,
+    Marginal,
+    NormalEquations,
+    compare_groups,
+    sum_equations,
+    sum_of_single_effects,
+)
 from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Rival, moved_last
+from hydrotele.gap.run_differences import NUISANCE, Quantity, between_runs, compare_between_runs, effect_of, find_columns
 from hydrotele.gap.screening import Screened
 from hydrotele.gap.search import Found
 
@@ -32,8 +42,8 @@ RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
 """Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
-_OWN_SCALE = 10.0  # prior standard deviations within which the parameters of accepted effects may move again
 _JOINT = 40  # best effects among which a pair is looked for
+_LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
@@ -116,18 +126,27 @@ class Proposal:
     parameter_scale: float = 0.0
 
     @property
+    def law(self) -> LawForm | None:
+        """The law or profile; None of effects and of the calibration."""
+        first = self.parts[0][0] if self.parts else None
+        return first.form if isinstance(first, LawHypothesis) else None
+
+    @property
     def key(self) -> tuple[str, str]:
         """Name and location of the first effect."""
         return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
 
 
-def search_model(model: GapModel, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
+def search_model(
+    model: GapModel, candidates: Sequence[Hypothesis], progress: Progress | None = None, has_laws: bool = False
+) -> Found:
     """Find the effects that the data ask for.
 
     Args:
         model: of the fit runs.
         candidates: the effects.
         progress: called with (what is done, fraction done).
+        has_laws: whether laws without a known cause are learned.
 
     Returns:
         The model, its rivals, and the first ranking.
@@ -137,25 +156,8 @@ def search_model(model: GapModel, candidates: Sequence[Hypothesis], progress: Pr
     given = Model(settle_noise(model, model.judged(Guess())))
     model.keep(given.judged)
     candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
-    now, first = given, tuple[Proposal, ...]()
-    keys: set[tuple[str, str]] | None = None
-    rounds: list[Round] = []
-    for index in range(model.max_effects):
-        share = 0.05 + 0.8 * index / model.max_effects
-        tell("compare effects", share)
-        pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals = propose(model, now, pool)
-        first = first or tuple(proposals)
-        keys = keys or {p.key for p in proposals[:_KEPT]}
-        tell("refine the best effects", share + 0.03)
-        models = extensions(model, now, proposals)
-        better = min((*models, *colour_noise(model, now)), key=lambda m: m.charged_score, default=now)
-        if not better.charged_score < now.charged_score:
-            break
-        settled = settle(model, better)
-        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
-        now = settled
-        model.keep(now.judged)
+    rounds, first = add_effects(model, given, candidates, has_laws, tell)
+    now = rounds[-1].after if rounds else given
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
     tell("remove unnecessary effects", 0.87)
@@ -168,13 +170,56 @@ def search_model(model: GapModel, candidates: Sequence[Hypothesis], progress: Pr
         for k, h in enumerate(now.guess.hypotheses)
     )
     without = tuple(
-        None if h.name == CALIBRATION else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
+        None if h.name in NUISANCE else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
     )
     ranking = tuple(
         Screened(p.parts[0][0], p.factor, p.factor, p.parts[0][1])
         for p in first if len(p.parts) == 1 and p.factor > 0.0
     )  # fmt: skip
     return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
+
+
+def add_effects(
+    model: GapModel, now: Model, candidates: Sequence[Hypothesis], has_laws: bool, tell: Progress
+) -> tuple[list[Round], tuple[Proposal, ...]]:
+    """Add effects, laws, the calibration, coloured noise and differences between runs as long as each brings enough.
+
+    Args:
+        model: whose base is `now`.
+        now: the model.
+        candidates: the effects.
+        has_laws: whether laws without a known cause are learned.
+        tell: called with (what is done, fraction done).
+
+    Returns:
+        The rounds, and the proposals of the first one.
+    """
+    quantities, effects = model.list_quantities(candidates), list(dict.fromkeys(c.name for c in candidates))
+    first = tuple[Proposal, ...]()
+    keys: set[tuple[str, str]] | None = None
+    rounds: list[Round] = []
+    for index in range(model.max_effects):
+        share = 0.05 + 0.8 * index / model.max_effects
+        tell("compare effects", share)
+        pool = [c for c in candidates if keys is None or c.key in keys]
+        proposals, varying = propose(
+            model, now, [c for c in pool if not acts_for_a_while(c)], quantities, effects, has_laws
+        )
+        proposals = sorted([*proposals, *propose_disturbances(model, now, candidates)], key=lambda p: -p.factor)
+        first = first or tuple(proposals)
+        kept = [p.key for p in proposals if not p.law][:_KEPT]
+        keys = keys or {*kept, *(effect_of(p.key[1]) for p in varying[:_KEPT])}
+        tell("refine the best effects", share + 0.03)
+        models = extensions(model, now, proposals)
+        others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
+        better = min((*models, *others), key=lambda m: m.charged_score, default=now)
+        if not better.charged_score < now.charged_score:
+            break
+        settled = settle(model, better)
+        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        now = settled
+        model.keep(now.judged)
+    return rounds, first
 
 
 def settle_noise(model: GapModel, judged: Judged) -> Judged:
@@ -189,18 +234,36 @@ def settle_noise(model: GapModel, judged: Judged) -> Judged:
 
 
 def settle(model: GapModel, one: Model) -> Model:
-    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base."""
+    """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base.
+
+    The prior of a law was selected while residual inputs hid a part of it. It is selected again as long as that brings
+    evidence.
+    """
     if not one.guess.parts:
         return Model(settle_noise(model, one.judged))
-    judged, fit = model.settle(one.judged)
+    found = _settle_fit(model, one.judged)
+    while any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
+        again = _settle_fit(model, model.judged(model.select_priors(found.guess), same=True))
+        if again.score > found.score - _SETTLED:
+            model.set_base(found.judged)
+            break
+        found = again
+    return found
+
+
+def _settle_fit(model: GapModel, judged: Judged) -> Model:
+    judged, fit = model.settle(judged)
     return Model(settle_noise(model, judged), fit, fit.whole_penalty)
 
 
 # -- linear step ------------------------------------------------------------------------------------------------------
 
 
-def propose(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
-    """Rank effects by their Bayes factors in the linearised model.
+def propose(
+    model: GapModel, now: Model, candidates: Sequence[Hypothesis], quantities: Mapping[str, Quantity] | None = None,
+    effects: Collection[str] = (), has_laws: bool = False,
+) -> tuple[list[Proposal], list[Proposal]]:  # fmt: skip
+    """Rank effects, laws, and parameters that may differ between the runs, by their Bayes factors in the linear model.
 
     The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
     the size and the version that make it largest; the calibration with the size and the scale of the uncertain
@@ -210,44 +273,97 @@ def propose(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> li
         model: whose base is `now`.
         now: the model.
         candidates: effects that may be added.
+        quantities: parameters that may differ between the runs.
+        effects: names of effects whose coefficient may vary.
+        has_laws: whether learned laws are compared, too.
 
     Returns:
-        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first.
+        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first;
+        and one proposal per parameter that may differ, the best first.
     """
     taken = {h.key for h in now.guess.hypotheses}
     versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
     table = model.linearise(now.guess, versions, model.uncertain_parameters(now.guess))
-    fraction = table.fraction
     best: dict[tuple[str, str], Proposal] = {}
+    varying: dict[tuple[str, str], Proposal] = {}
+    columns = find_columns(table, quantities or {}) if len(model.run_names) > 2 else []
     chosen: dict[tuple[str, str], int] = {}
     gains: dict[float, float] = {}
-    has_calibration, start = (CALIBRATION, "all") in taken, None
-    for residual_scale in RESIDUAL_SCALES:
-        terms, loss = table.equations(residual_scale)
-        for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration else None]:
-            marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
-            total = loss - terms.squares + marginal.loss
-            start = total if start is None else start
-            gained = (start - total) / fraction
-            if parameter_scale > 0.0:
-                _keep(best, Proposal((), gained, residual_scale, parameter_scale))
-                continue
-            factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
-            gains[residual_scale] = gained
-            for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
-                part = version.hypothesis, version.deviation(mean)
-                proposal = Proposal((part,), gained + float(factor) / fraction, residual_scale)
-                if _keep(best, proposal):
-                    chosen[proposal.key] = index
-    ranked = sorted(best.values(), key=lambda p: -p.factor)
-    single = [p for p in ranked if p.parts]
+    has_calibration = (CALIBRATION, "all") in taken
+    starts: list[float] = []
+
+    def compare(table: Linearisation) -> None:
+        for residual_scale in RESIDUAL_SCALES:
+            by_run, loss = table.equations(residual_scale)
+            terms = sum_equations(by_run)
+            for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration or table.laws else None]:
+                scales = np.where(table.own, OWN_SCALE, parameter_scale)
+                marginal = terms.marginalise(scales)
+                total = loss - terms.squares + marginal.loss
+                starts.append(total)
+                gained = (starts[0] - total) / table.fraction
+                if parameter_scale > 0.0:
+                    _keep(best, Proposal((), gained, residual_scale, parameter_scale))
+                    continue
+                gains[residual_scale] = gained
+                for index, part, factor in _compare_columns(table, terms, marginal):
+                    proposal = Proposal((part,), gained + factor / table.fraction, residual_scale)
+                    if _keep(best, proposal) and not table.laws:
+                        chosen[proposal.key] = index
+                own = () if table.laws else compare_between_runs(by_run, columns, scales, PARAMETER_SCALES[1:])
+                for column, scale, factor, mean in own:
+                    group = between_runs(column.quantity, model.run_names, scale)
+                    part = group, np.clip(np.append(mean, 0.0), group.low, group.high)  # the held-out run is unknown
+                    _keep(varying, Proposal((part,), gained + factor / table.fraction, residual_scale))
+
+    def compare_laws(laws: Sequence[LawForm]) -> None:
+        new = [law for law in laws if law.key not in taken]
+        for begin in range(0, len(new), _LAWS_AT_ONCE):
+            compare(table.with_laws(new[begin : begin + _LAWS_AT_ONCE]))
+
+    compare(table)
+    forms = table.list_laws(now.judged, effects, has_laws)
+    compare_laws(forms)
+    free = [form for form in forms if not form.effect and form.key in best]
+    if free:
+        compare_laws(table.list_pairs(max(free, key=lambda form: best[form.key].factor)))
+    ranked, differing = (sorted(found.values(), key=lambda p: -p.factor) for found in (best, varying))
+    single = [p for p in ranked if p.key in chosen]
     if not single:
-        return ranked
+        return ranked, differing
     scale = single[0].residual_scale
     pair = propose_pair(table, [chosen[p.key] for p in single[:_JOINT]], scale)
     if pair is None:
-        return ranked
-    return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked]
+        return ranked, differing
+    return [Proposal(pair[0], gains[scale] + pair[1] / table.fraction, scale), *ranked], differing
+
+
+def _compare_columns(
+    table: Linearisation, terms: NormalEquations, marginal: Marginal
+) -> Iterator[tuple[int, tuple[Hypothesis, np.ndarray], float]]:
+    """Yield the place of each version, or of each law with each of its priors, its start, and twice its factor."""
+    if not table.laws:
+        factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
+        for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
+            yield index, (version.hypothesis, version.deviation(mean)), float(factor)
+    for index, law in enumerate(table.laws):
+        right, block = marginal.right[terms.edges[index] : terms.edges[index + 1]], marginal.blocks[index]
+        factor, root, mean = best_prior(law, right, block)
+        yield index, (law.hypothesis(root), mean), factor
+
+
+def propose_disturbances(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
+    """Rank forces that act for a while or periodically, in one run or in all, on all rows of the runs.
+
+    Args:
+        model: whose base is `now`.
+        now: the model.
+        candidates: effects, among them those that act for a while.
+    """
+    found: dict[tuple[str, str], Proposal] = {}
+    for part, factor, scale in model.compare_disturbances(now.judged, candidates, RESIDUAL_SCALES):
+        _keep(found, Proposal((part,), factor, scale))
+    return list(found.values())
 
 
 def propose_pair(
@@ -264,9 +380,9 @@ def propose_pair(
         The effects with their deviations, and twice the log Bayes factor of both together; None if fewer than two
         components prefer an effect.
     """
-    terms, _ = table.equations(residual_scale, chosen)
+    by_run, _ = table.equations(residual_scale, chosen)
     chosen_versions = [table.versions[g] for g in chosen]
-    marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, 0.0))
+    marginal = sum_equations(by_run).marginalise(np.where(table.own, OWN_SCALE, 0.0))
     edges = np.cumsum([0, *(v.steps.shape[1] for v in chosen_versions)])
     gram = marginal.blocks[0]
     chances, _ = sum_of_single_effects(gram, marginal.right, edges, _COMPONENTS)
@@ -295,7 +411,10 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 
 def extensions(model: GapModel, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
     """Refine the best proposals that the linear step holds for better than the model."""
-    chosen = [p for p in proposals[:_TRIED] if p.factor > MIN_LOG_BAYES_FACTOR]
+    better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
+    chosen = [p for p in better if not p.law][:_TRIED]
+    laws = {p.law.kind: p for p in reversed(better) if p.law}
+    chosen += laws.values()
     return [m for m in (refine(model, now, p) for p in chosen) if m is not None]
 
 
@@ -308,7 +427,7 @@ def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
         proposal: what is added.
 
     Returns:
-        The extended model; None where it cannot follow the runs.
+        The extended model; None where it cannot follow the runs, or the change is not relevant.
     """
     guess, dense = now.guess, not proposal.parts
     if dense:
@@ -375,7 +494,7 @@ def exchange(
     order, best = list(range(len(rests))), now
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         origin = next((r for r in rounds if hypothesis.key in keys_of(r.after) - keys_of(r.before)), None)
-        if hypothesis.name == CALIBRATION or origin is None:
+        if hypothesis.name in NUISANCE or origin is None:
             rivals.append(())
             continue
         rest, taken = rests[index], keys_of(now)

@@ -21,6 +21,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from hydrotele.core.compiled import compiled
 
+OWN_SCALE = 10.0
+"""Prior standard deviations within which the parameters of accepted effects may move again."""
 _CONVERGED = 1.0e-3  # prior standard deviations; change of all coefficients that ends the iteration
 
 

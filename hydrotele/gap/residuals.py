@@ -28,7 +28,7 @@ import numpy as np
 from scipy.special import expit
 
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess
+from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED, Guess
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_size
 from hydrotele.estimate.track import STEP, Track, track_run
 from hydrotele.gap.result import LearnedLaw, NamedEffect
@@ -164,10 +164,10 @@ def _spread(evidence: Evidence, guess: Guess) -> tuple[float, str]:
 
 
 def _calibrated(guess: Guess) -> set[int]:
-    """Places of numbers that belong to a calibration: they may take up what runs differ by."""
+    """Places of numbers that belong to a calibration or a learned law: they may take up what runs differ by."""
     found, first = set(), 0
     for hypothesis, deviation in guess.parts:
-        if hypothesis.name == CALIBRATION:
+        if hypothesis.name == CALIBRATION or hypothesis.name.startswith(LEARNED):
             found |= set(range(first, first + len(deviation)))
         first += len(deviation)
     return found

@@ -22,8 +22,11 @@ SURE = 0.95
 LIKELY = 0.5
 """Probability above which an effect may explain a part: likelier than all else."""
 
+VARIES = "_by_"
+"""Joins an effect and the variable with which its coefficient varies."""
+
 Method = Literal["search", "regression"]
-Verdict = Literal["named", "partly", "ambiguous", "unknown", "no_gap"]
+Verdict = Literal["named", "partly", "ambiguous", "learned", "unknown", "no_gap"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,25 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class Profile:
+    """A coefficient that varies with one variable.
+
+    Attributes:
+        variable: such as `position`, of the same drive.
+        variable_unit: SI.
+        points: (k,) values of the variable.
+        values: (k,) coefficient there [unit of the effect's parameter].
+        spread: (k,) standard deviations.
+    """
+
+    variable: str
+    variable_unit: str
+    points: tuple[float, ...]
+    values: tuple[float, ...]
+    spread: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class NamedEffect:
     """An effect that the data ask for.
 
@@ -65,6 +87,7 @@ class NamedEffect:
         parameters: its numbers.
         alternatives: rivals that the data cannot rule out.
         share: of the gap on the held-out run that it closes, by what comes back without it.
+        profile: coefficient of an effect that varies; the parameter is its mean then.
     """
 
     name: str
@@ -73,6 +96,7 @@ class NamedEffect:
     parameters: Mapping[str, Estimate]
     alternatives: tuple[Alternative, ...] = ()
     share: float = math.nan
+    profile: Profile | None = None
 
     @property
     def other_forms(self) -> tuple[Alternative, ...]:
@@ -375,7 +399,7 @@ class Gap(Generic[Model]):
     Attributes:
         machine: the model that was given: a Machine, or the model of a mechanism.
         patched: the model with the named effects; the same object if nothing was named.
-        verdict: named, partly, ambiguous, unknown or no_gap.
+        verdict: named, partly, ambiguous, learned, unknown or no_gap.
         effects: the named effects, the surest first.
         unknown: what no effect explains, or None.
         size: the gap on the held-out run before and after.
@@ -439,10 +463,11 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         gap: what the search yields.
 
     Returns:
-        `verdict`: named, partly, ambiguous, unknown or no_gap.
+        `verdict`: named, partly, ambiguous, learned, unknown or no_gap.
         `effects`: named effects, see `effect_document`; `share` is the part of the held-out run's
         gap that comes back without the effect, `mechanism_probability` counts alternatives that are
-        the same mechanism in another form (a lag for a delay), and decides the verdict.
+        the same mechanism in another form (a lag for a delay), and decides the verdict. An effect whose coefficient
+        varies has a `profile`: `variable`, `points` [`variable_unit`], `values` and their `spread`.
         `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
         `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
         flow_supply, command), `axis`, `variable`, `other` (a second variable, or empty), `formula`
@@ -569,7 +594,8 @@ def explanation_document(why: VerdictExplanation) -> dict[str, Any]:
 
 def effect_document(effect: NamedEffect) -> dict[str, Any]:
     """One effect as it stands in `gap.json`."""
-    return {
+    profile = {} if effect.profile is None else {"profile": dataclasses.asdict(effect.profile)}
+    return profile | {
         "name": effect.name,
         "location": effect.location,
         "probability": effect.probability,

@@ -64,6 +64,7 @@ _VERDICT_LABELS = {
     "ambiguous": "Ambiguous",
     "unknown": "Unknown effect",
     "partly": "Partly identified",
+    "learned": "Law learned",
 }
 
 

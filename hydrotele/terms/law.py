@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from hydrotele.core.compiled import compiled
 from hydrotele.core.datafile import (
     MAX_MAGNITUDE,
     suggest_valid_name,
@@ -531,6 +532,35 @@ def formula(s: DriveState, numbers: Numbers) -> float:
             at += 6
         total += product
     return total
+
+
+def _encode_product(parameters: Parameters) -> Parameters:
+    """Encode the text `product` of a `scaled_table` for the law `formula`."""
+    given = dict(parameters)
+    product = given.pop("product", None)
+    if not isinstance(product, str):
+        raise ValueError(f"law scaled_table: product must be a text such as 'velocity', not {product!r}")
+    return {**given, **encode_formula({product: 1.0})}
+
+
+_linear_table, _formula = compiled(linear_table), compiled(formula)
+
+
+@law(check=_check_table, translate=_encode_product)
+def scaled_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers, numbers: Numbers) -> float:
+    """Multiply a product of basic functions by a coefficient that is a table of one state variable.
+
+    Machine files give `product` (syntax of the module docstring) instead of `numbers`, its encoding. `values` are the
+    coefficient at the increasing `points` [unit of the variable]. With `product: sign(velocity, 0.005)` and a table
+    over `position` it is Coulomb friction that varies along the travel.
+
+    >>> import numpy as np
+    >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=2.0)
+    >>> product = np.array(encode_formula({"velocity": 1.0})["numbers"])
+    >>> float(scaled_table(state, 1, np.array([0.0, 1.0]), np.array([0.0, -10.0]), product))
+    -10.0
+    """
+    return _linear_table(s, variable, points, values) * _formula(s, numbers)
 
 
 @law

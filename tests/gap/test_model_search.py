@@ -13,7 +13,6 @@ from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.machine_model import scale_residual_inputs
-from hydrotele.gap.profiles import find_profiles
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
@@ -145,13 +144,9 @@ def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, freq
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
     """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
     data = select_exciting_segments(load_dataset([MEASURED / "open_02"], load_machine("cat215")), 45.0)
-    evidence = Evidence(data, data.fit, 2, STEP, lacking=True)
-    try:
-        evidence.set_base(Guess())
-        judged = evidence.set_base(Guess().plus(_effect("coulomb_friction", "stick"), np.array([0.5])))
-        (profile,) = find_profiles(evidence, judged)
-    finally:
-        evidence.close()
-    assert (profile.name, profile.variable) == ("coulomb_friction", "position")
-    spacing = profile.points[1] - profile.points[0]
-    assert abs(profile.points[np.argmax(profile.ratios)] - 0.72) < spacing
+    gap = find_gap(data, effects=("coulomb_friction",), jobs=2, method="regression")
+    assert gap.verdict == "named"
+    (effect,) = gap.effects
+    assert (effect.name, effect.location) == ("coulomb_friction_by_position", "stick")
+    points, values = effect.profile.points, effect.profile.values
+    assert abs(points[int(np.argmax(values))] - 0.72) < 0.1

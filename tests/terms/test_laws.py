@@ -44,6 +44,9 @@ USED = {
         "row_variable": "position", "column_variable": "velocity", "row_points": [0, 0.5, 1],
         "column_points": [-1, 0], "values": [[1, 2], [3, 5], [7, 11]],
     },
+    "scaled_table": {
+        "variable": "position", "points": [0.0, 0.5], "values": [-1.0, -6.0], "product": "sign(velocity, 0.1)",
+    },
     "formula": {"1": 2.0, "velocity * abs(velocity)": -3.0, "above(position, 0.4) ** 2": 1e3},
     "quadratic_drag": {"coefficient": 40.0},
     "load_friction": {"coefficient": 0.04, "smoothing_velocity": 0.1},
@@ -69,6 +72,7 @@ def by_hand(name, p):
         "exponential_drift": 7.0 * (1 - math.exp(-0.85)),
         "linear_table": np.interp(-0.21, [-1, -0.2, 0.5], [4, 1, -2]),
         "bilinear_table": 0.14 * (0.21 * 1 + 0.79 * 2) + 0.86 * (0.21 * 3 + 0.79 * 5),
+        "scaled_table": (1.0 + 5.0 * 0.86) * math.tanh(2.1),
         "formula": 2.0 + 3.0 * 0.21**2 + 1e3 * 0.03**2,
         "quadratic_drag": 40.0 * 0.21**2,
         "load_friction": 0.04 * 1.2e5 * math.tanh(2.1),
