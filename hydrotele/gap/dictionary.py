@@ -87,12 +87,14 @@ class Dictionary:
         columns: per version (E, q) change of the whitened errors per prior standard deviation.
         nuisance: (E, K) the same of the model's own and of the uncertain parameters.
         own: (K,) whether a nuisance column is a parameter of the model itself.
+        parameters: (K,) name of each nuisance column, and its prior standard deviation [SI].
     """
 
     versions: tuple[Version, ...]
     columns: tuple[np.ndarray, ...]
     nuisance: np.ndarray
     own: np.ndarray
+    parameters: tuple[tuple[str, float], ...] = ()
 
     def select(self, indices: Sequence[int]) -> "Dictionary":
         """Return a dictionary of some versions."""
@@ -138,4 +140,6 @@ def build_dictionary(
     finite = np.isfinite(table).all(axis=0)
     own = np.arange(len(nudges)) < len(guess.deviation)
     versions, columns = [versions[k] for k in valid], [columns[k] for k in valid]
-    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite])
+    sizes = [p.prior_std for h in whole.hypotheses for p in h.parameters.values()]
+    parameters = tuple(pair for pair, kept in zip(zip(whole.names, sizes, strict=True), finite, strict=True) if kept)
+    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite], parameters)

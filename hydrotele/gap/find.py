@@ -26,6 +26,7 @@ from hydrotele.gap.description import describe, effect_title, learned_laws
 from hydrotele.gap.discover import LEARNED, Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
+from hydrotele.gap.heldout import compare_heldout
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
@@ -58,8 +59,9 @@ from hydrotele.gap.result import (
     VerdictExplanation,
 )
 from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
+from hydrotele.gap.run_differences import NUISANCE, RunDifference, between_run_differences, difference_words
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.logs.dataset import Dataset
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
@@ -158,6 +160,11 @@ def find_gap(
     try:
         found = find(evidence, candidates, tell)
         discovery = Discovery(found.judged, ())
+        differing: tuple[RunDifference, ...] = ()
+        if method == "regression":
+            tell("compare the held-out run with the fitted runs", 0.92)
+            found, differing = compare_heldout(evidence, found, candidates)
+            discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
                 notes.append(_REJECTED.format(worse))
@@ -185,16 +192,16 @@ def find_gap(
                 outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
         nominal, patched, judge = data.machine, outcome.patched, outcome.judge
         before, after = outcome.asked, outcome.after
-        tests, floor = judge.tests(evidence, discovery.judged, patched, after)
+        tests, floor = judge.tests(evidence, discovery.judged, after)
         # Numbers of effects were found before the laws, and so were their intervals.
         told = found.judged if discovery.laws else discovery.judged
         evidence.set_base(told)
         scatter = tests.get("constancy", {}).get("value", 1.0)
         covariance = posterior_covariance(evidence, told.guess, scatter)
         spread = np.sqrt(np.diag(covariance))
-        method_notes = []
+        method_notes = [difference_words(d) for d in (*between_run_differences(told.guess, covariance), *differing)]
         if method == "regression":
-            method_notes = [profile_words(p) for p in find_profiles(evidence, told)]
+            method_notes += [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
         traces = trace_inputs(evidence.data, found.base, discovery.judged)
     finally:
@@ -299,19 +306,21 @@ class _Judge:
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
-        self, machines: Sequence[Machine], each: Callable, runs: Sequence | None = None
+        self, models: Sequence[Machine | Guess], each: Callable, runs: Sequence | None = None
     ) -> list[tuple[Track, ...]]:
-        """Per machine the tracks of the held-out run and the fit runs, or of some runs."""
+        """Per model the tracks of the held-out run and the fit runs, or of some runs."""
         runs = self.runs if runs is None else runs
-        pairs = [(machine, run) for run in runs for machine in machines]
+        pairs = [(self.machine_in(model, run), run) for run in runs for model in models]
         found = list(each(
             lambda pair: track_run(pair[0], self.data, pair[1], levels=self.levels), pairs,
         ))  # fmt: skip
-        return [tuple(found[k :: len(machines)]) for k in range(len(machines))]
+        return [tuple(found[k :: len(models)]) for k in range(len(models))]
 
-    def tests(
-        self, evidence: Evidence, judged: Judged, machine: Machine, tracks: Sequence[Track]
-    ) -> tuple[dict, float | None]:
+    def machine_in(self, model: Machine | Guess, run: RunData) -> Machine:
+        """Return the machine of a model in a run."""
+        return model if isinstance(model, Machine) else model.machine(self.data.machine, run.name)
+
+    def tests(self, evidence: Evidence, judged: Judged, tracks: Sequence[Track]) -> tuple[dict, float | None]:
         """Tests of what a guess leaves, and the noise floor: what readings of its own leave.
 
         A floor is refused where the perfect machine's own runs cannot be followed: they left the
@@ -321,7 +330,8 @@ class _Judge:
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
         known = self.ripple or bool(self.levels.colours)
-        perfect = () if known else perfect_tracks(machine, noisy, tracks, evidence.map)
+        machines = [self.machine_in(judged.guess, track.run) for track in tracks]
+        perfect = () if known else perfect_tracks(machines, noisy, tracks, evidence.map)
         floor = 1.0 if known else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
         clean = holds and not known
@@ -347,9 +357,8 @@ class _Judge:
 
         def share(index: int) -> float:
             hypothesis = guess.parts[index][0]
-            machine = guess.without(index).machine(self.data.machine)
-            once = {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
-            (without,) = self.tracks([machine], map, self.runs if once else self.runs[:1])
+            once = hypothesis.runs or {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
+            (without,) = self.tracks([guess.without(index)], map, self.runs if once else self.runs[:1])
             then, now = (rms(t if once else t[:1]) ** 2 for t in (before, after))
             whole, back = then - (floor or 1.0) ** 2, rms(without) ** 2 - now
             return float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
@@ -386,8 +395,8 @@ class _Outcome:
         """What a guess and its laws make of them; `opened` where free runs calibrated `given`."""
         data, judge = evidence.data, _Judge(evidence.data, discovery.judged)
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
-        machines = [nominal, *([patched] if patched is not nominal else [])]
-        before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
+        models = [nominal, *([discovery.judged.guess] if discovery.judged.guess.parts else [])]
+        before, *others = judge.tracks(models + ([given] if opened else []), evidence.map)
         asked = others.pop() if opened else before
         after = others[0] if others else before
         worse = _worse(data, patched, before, after, opened, jobs)
@@ -410,7 +419,7 @@ def _worse_held_out(evidence: Evidence, judged: Judged, opened: FreeCalibration 
         return ""
     data, patched = evidence.data, judged.guess.machine(evidence.data.machine)
     judge = _Judge(data, judged)
-    before, after = judge.tracks([data.machine, patched], evidence.map, (data.heldout,))
+    before, after = judge.tracks([data.machine, judged.guess], evidence.map, (data.heldout,))
     return _worse(data, patched, before, after, opened, jobs)
 
 
@@ -463,7 +472,7 @@ def _named(found: Found, last: Guess, spread: np.ndarray, shares: Mapping) -> tu
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
         rest = found.without[index]
-        if hypothesis.name == CALIBRATION or rest is None:
+        if hypothesis.name in NUISANCE or rest is None:
             continue
         chance, others = _chances(found, index, rest)
         trust = _trust(found, rest)

@@ -11,7 +11,7 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,15 +19,32 @@ import numpy as np
 from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.filter import Gains
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
-from hydrotele.gap.regression import NormalEquations, compare_groups, reweight_columns, sum_of_single_effects
+from hydrotele.gap.disturbances import acts_for_a_while, compare_disturbances, list_disturbances
+from hydrotele.gap.regression import (
+    NormalEquations,
+    compare_groups,
+    reweight_columns,
+    sum_equations,
+    sum_of_single_effects,
+)
 from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Rival, moved_last
+from hydrotele.gap.run_differences import (
+    NUISANCE,
+    Quantity,
+    between_runs,
+    compare_between_runs,
+    effect_of,
+    find_columns,
+    list_quantities,
+    rescale_between_runs,
+)
 from hydrotele.gap.screening import Screened, timed
 from hydrotele.gap.search import Found
 from hydrotele.machine.machine import Machine
@@ -130,6 +147,11 @@ class Proposal:
         """Name and location of the first effect."""
         return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
 
+    @property
+    def varies_between_runs(self) -> bool:
+        """Whether it lets a parameter differ from run to run."""
+        return self.key[0] == BETWEEN_RUNS
+
 
 def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
     """Find the effects that the data ask for.
@@ -146,26 +168,10 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     tell("estimate the noise levels of the given model", 0.0)
     given = Model(settle_noise(evidence, evidence.judged(Guess())))
     evidence.keep(given.judged)
-    candidates = timed([c for c in candidates if c.name not in _EXCLUDED], given.judged)
-    now, first = given, tuple[Proposal, ...]()
-    keys: set[tuple[str, str]] | None = None
-    rounds: list[Round] = []
-    for index in range(_MAX_EFFECTS):
-        share = 0.05 + 0.8 * index / _MAX_EFFECTS
-        tell("compare effects", share)
-        pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals = propose(evidence, now, pool)
-        first = first or tuple(proposals)
-        keys = keys or {p.key for p in proposals[:_KEPT]}
-        tell("refine the best effects", share + 0.03)
-        models = extensions(evidence, now, proposals)
-        better = min((*models, *colour_noise(evidence, now)), key=lambda m: m.charged_score, default=now)
-        if not better.charged_score < now.charged_score:
-            break
-        settled = settle(evidence, better)
-        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
-        now = settled
-        evidence.keep(now.judged)
+    candidates = [c for c in candidates if c.name not in _EXCLUDED]
+    quantities = list_quantities(evidence.data.machine, candidates)
+    rounds, first = add_effects(evidence, given, timed(candidates, given.judged), quantities, tell)
+    now = rounds[-1].after if rounds else given
     tell("compare coloured noise", 0.85)
     now = compare_colours(evidence, now)
     tell("remove unnecessary effects", 0.87)
@@ -178,13 +184,53 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
         for k, h in enumerate(now.guess.hypotheses)
     )
     without = tuple(
-        None if h.name == CALIBRATION else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
+        None if h.name in NUISANCE else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
     )
     ranking = tuple(
         Screened(p.parts[0][0], p.factor, p.factor, p.parts[0][1])
         for p in first if len(p.parts) == 1 and p.factor > 0.0
     )  # fmt: skip
     return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
+
+
+def add_effects(
+    evidence: Evidence, now: Model, candidates: Sequence[Hypothesis], quantities: Mapping[str, Quantity], tell: Progress
+) -> tuple[list[Round], tuple[Proposal, ...]]:
+    """Add effects, the calibration, coloured noise and differences between runs as long as each brings enough.
+
+    Args:
+        evidence: whose base is the model.
+        now: the model.
+        candidates: the effects.
+        quantities: parameters that may differ between the runs.
+        tell: called with (what is done, fraction done).
+
+    Returns:
+        The rounds, and the proposals of the first one.
+    """
+    first = tuple[Proposal, ...]()
+    keys: set[tuple[str, str]] | None = None
+    rounds: list[Round] = []
+    for index in range(_MAX_EFFECTS):
+        share = 0.05 + 0.8 * index / _MAX_EFFECTS
+        tell("compare effects", share)
+        pool = [c for c in candidates if keys is None or c.key in keys]
+        proposals, varying = propose(evidence, now, [c for c in pool if not acts_for_a_while(c)], quantities)
+        disturbances = propose_disturbances(evidence, now, candidates)
+        proposals = sorted([*proposals, *disturbances], key=lambda p: -p.factor)
+        first = first or tuple(proposals)
+        keys = keys or {p.key for p in proposals[:_KEPT]} | {effect_of(p.key[1]) for p in varying[:_KEPT]}
+        tell("refine the best effects", share + 0.03)
+        models = extensions(evidence, now, proposals)
+        others = [*colour_noise(evidence, now), *extensions(evidence, now, varying[:1])]
+        better = min((*models, *others), key=lambda m: m.charged_score, default=now)
+        if not better.charged_score < now.charged_score:
+            break
+        settled = settle(evidence, better)
+        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        now = settled
+        evidence.keep(now.judged)
+    return rounds, first
 
 
 def settle_noise(evidence: Evidence, judged: Judged) -> Judged:
@@ -202,15 +248,17 @@ def settle(evidence: Evidence, model: Model) -> Model:
     """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base."""
     if not model.guess.parts:
         return Model(settle_noise(evidence, model.judged))
-    judged, fit = fit_until_settled(evidence, model.judged)
+    judged, fit = rescale_between_runs(*fit_until_settled(evidence, model.judged), evidence.runs)
     return Model(settle_noise(evidence, judged), fit, fit.whole_penalty)
 
 
 # -- linear step ------------------------------------------------------------------------------------------------------
 
 
-def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
-    """Rank effects by their Bayes factors in the linearised model.
+def propose(
+    evidence: Evidence, now: Model, candidates: Sequence[Hypothesis], quantities: Mapping[str, Quantity] | None = None
+) -> tuple[list[Proposal], list[Proposal]]:
+    """Rank effects, and parameters that may differ between the runs, by their Bayes factors in the linearised model.
 
     The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
     the size and the version that make it largest; the calibration with the size and the scale of the uncertain
@@ -220,9 +268,11 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
         evidence: whose base is the model.
         now: the model.
         candidates: effects that may be added.
+        quantities: parameters that may differ between the runs.
 
     Returns:
-        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first.
+        Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first;
+        and one proposal per parameter that may differ, the best first.
     """
     taken = {h.key for h in now.guess.hypotheses}
     versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
@@ -233,11 +283,15 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
     table = build_dictionary(evidence, now.guess, versions, uncertain, tracks)
     fraction = sum(len(t.whitened) for t in tracks) / sum(len(t.whitened) for t in evidence.tracks)
     best: dict[tuple[str, str], Proposal] = {}
+    varying: dict[tuple[str, str], Proposal] = {}
+    columns = find_columns(table, quantities or {}) if len(tracks) > 1 else []
+    run_names = tuple(run.name for run in (*evidence.data.fit, evidence.data.heldout))
     chosen: dict[tuple[str, str], int] = {}
     gains: dict[float, float] = {}
     has_calibration, start = (CALIBRATION, "all") in taken, None
     for residual_scale in RESIDUAL_SCALES:
-        terms, loss = _normal_equations(evidence, tracks, table, residual_scale)
+        by_run, loss = _normal_equations(evidence, tracks, table, residual_scale)
+        terms = sum_equations(by_run)
         for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration else None]:
             marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, parameter_scale))
             total = loss - terms.squares + marginal.loss
@@ -248,21 +302,45 @@ def propose(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) ->
                 continue
             factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
             gains[residual_scale] = gained
+            scales = np.where(table.own, _OWN_SCALE, 0.0)
+            for column, scale, factor, mean in compare_between_runs(by_run, columns, scales, PARAMETER_SCALES[1:]):
+                group = between_runs(column.quantity, run_names, scale)
+                part = group, np.clip(np.append(mean, 0.0), group.low, group.high)  # the held-out run is unknown
+                _keep(varying, Proposal((part,), gained + factor / fraction, residual_scale))
             for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
                 part = version.hypothesis, version.deviation(mean)
                 proposal = Proposal((part,), gained + float(factor) / fraction, residual_scale)
                 if _keep(best, proposal):
                     chosen[proposal.key] = index
-    ranked = sorted(best.values(), key=lambda p: -p.factor)
+    ranked, differing = (sorted(found.values(), key=lambda p: -p.factor) for found in (best, varying))
     single = [p for p in ranked if p.parts]
     if not single:
-        return ranked
+        return ranked, differing
     scale = single[0].residual_scale
     kept = table.select([chosen[p.key] for p in single[:_JOINT]])
     pair = propose_pair(evidence, tracks, kept, scale)
     if pair is None:
-        return ranked
-    return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked]
+        return ranked, differing
+    return [Proposal(pair[0], gains[scale] + pair[1] / fraction, scale), *ranked], differing
+
+
+def propose_disturbances(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
+    """Rank forces that act for a while or periodically, in one run or in all, on all rows of the runs.
+
+    Args:
+        evidence: whose base is the model.
+        now: the model.
+        candidates: effects, among them those that act for a while.
+    """
+    taken = keys_of(now)
+    tried = [h for h in list_disturbances(evidence.data, candidates, now.judged) if h.key not in taken]
+    found: dict[tuple[str, str], Proposal] = {}
+    for scale in RESIDUAL_SCALES if tried else ():
+        tracks = evidence.map(lambda track, rho=scale: scale_residual_inputs(track, rho), evidence.tracks)
+        gained = sum(old.loss - new.loss for old, new in zip(evidence.tracks, tracks, strict=True))
+        for part, factor in compare_disturbances(tried, tracks, evidence.map):
+            _keep(found, Proposal((part,), gained + factor, scale))
+    return list(found.values())
 
 
 def propose_pair(
@@ -281,8 +359,9 @@ def propose_pair(
         components prefer an effect.
     """
     joint = dataclasses.replace(table, columns=(np.hstack(table.columns),))
-    terms, _ = _normal_equations(evidence, tracks, joint, residual_scale)
-    marginal = terms.marginalise(np.where(table.own, _OWN_SCALE, 0.0))
+    marginal = sum_equations(_normal_equations(evidence, tracks, joint, residual_scale)[0]).marginalise(
+        np.where(table.own, _OWN_SCALE, 0.0)
+    )
     edges = np.cumsum([0, *(c.shape[1] for c in table.columns)])
     gram = marginal.blocks[0]
     chances, _ = sum_of_single_effects(gram, marginal.right, edges, _COMPONENTS)
@@ -321,8 +400,8 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 
 def _normal_equations(
     evidence: Evidence, tracks: Sequence[Track], table: Dictionary, residual_scale: float
-) -> tuple[NormalEquations, float]:
-    """Normal equations with the residual inputs scaled, and -2 log likelihood of the errors there."""
+) -> tuple[list[NormalEquations], float]:
+    """Per run the normal equations with the residual inputs scaled, and -2 log likelihood of all errors there."""
     edges = np.cumsum([0, *(t.whitened.size for t in tracks)])
     widths = np.cumsum([0, *(c.shape[1] for c in table.columns), table.nuisance.shape[1]])
 
@@ -343,10 +422,7 @@ def _normal_equations(
         return NormalEquations.of(errors, groups, columns[:, widths[-2] :]), scaled.loss
 
     found = evidence.map(of_run, range(len(tracks)))
-    terms = found[0][0]
-    for other, _ in found[1:]:
-        terms = terms + other
-    return terms, sum(loss for _, loss in found)
+    return [terms for terms, _ in found], sum(loss for _, loss in found)
 
 
 def scale_residual_inputs(track: Track, scale: float) -> Track:
@@ -474,6 +550,7 @@ def refine(evidence: Evidence, now: Model, proposal: Proposal) -> Model | None:
             judged = evidence.judged_from(fit.guess, tracks[0].levels)
     finally:
         evidence.set_base(now.judged)
+    judged, fit = rescale_between_runs(judged, fit, evidence.runs)
     return Model(judged, fit, fit.whole_penalty) if np.isfinite(judged.loss) else None
 
 
@@ -544,7 +621,7 @@ def exchange(
     order, best = list(range(len(rests))), now
     for index, (hypothesis, _) in enumerate(now.guess.parts):
         origin = next((r for r in rounds if hypothesis.key in keys_of(r.after) - keys_of(r.before)), None)
-        if hypothesis.name == CALIBRATION or origin is None:
+        if hypothesis.name in NUISANCE or origin is None:
             rivals.append(())
             continue
         rest, taken = rests[index], keys_of(now)

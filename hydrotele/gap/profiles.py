@@ -96,13 +96,13 @@ def _state_changes(evidence: Evidence, guess: Guess, index: int) -> list[np.ndar
     moved = guess.deviation
     step = -_STEP if moved[first] + _STEP > guess.hypotheses[index].high[0] else _STEP
     moved[first] += step
-    machine, changed = guess.machine(nominal), guess.at(moved).machine(nominal)
-    if state_names(machine) != state_names(changed):
+    both = guess, guess.at(moved)
+    if len({tuple(state_names(one.machine(nominal))) for one in both}) > 1:
         return None
     found = []
     for track in evidence.tracks:
         later = []
-        for one in (machine, changed):
+        for one in (side.machine(nominal, track.run.name) for side in both):
             model, ends = reduced_model(one, ()), np.empty(track.states.shape)
             steps = steps_per_row(one, track.run.period, COARSE)
             _rows_later(model, model_space(model), track.states, track.run.command, track.run.period, steps, ends)

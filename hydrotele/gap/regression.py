@@ -12,6 +12,7 @@ The same errors and columns under other noise levels follow from the linearised 
 (`reweight_columns`).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -109,6 +110,39 @@ class NormalEquations:
         )
         loss = self.squares - float((scales * self.nuisance_right) @ taken) + log_det
         return Marginal(loss, self.right - cross.T @ taken, blocks)
+
+
+def sum_equations(terms: Sequence[NormalEquations]) -> NormalEquations:
+    """Add the products of several runs."""
+    total = terms[0]
+    for other in terms[1:]:
+        total = total + other
+    return total
+
+
+def split_columns(by_run: Sequence[NormalEquations], single: Sequence[int], nuisance: Sequence[int]) -> NormalEquations:
+    """Give single columns a coefficient of their own in every run.
+
+    Args:
+        by_run: the products of R runs with the same columns.
+        single: indices of groups with one column each.
+        nuisance: indices of nuisance columns, which stay nuisance as well.
+
+    Returns:
+        The products of all runs together; the groups are those of `single`, then of `nuisance`, each with R columns.
+    """
+    total = sum_equations(by_run)
+    right = [[t.right[t.edges[g]] for t in by_run] for g in single]
+    right += [[t.nuisance_right[k] for t in by_run] for k in nuisance]
+    blocks = [np.diag([t.blocks[g][0, 0] for t in by_run]) for g in single]
+    blocks += [np.diag([t.nuisance[k, k] for t in by_run]) for k in nuisance]
+    cross = [np.column_stack([t.cross[:, t.edges[g]] for t in by_run]) for g in single]
+    cross += [np.column_stack([t.nuisance[:, k] for t in by_run]) for k in nuisance]
+    edges = len(by_run) * np.arange(len(blocks) + 1)
+    return dataclasses.replace(
+        total, edges=edges, right=np.ravel(right), blocks=tuple(blocks),
+        cross=np.hstack(cross) if cross else total.cross[:, :0],
+    )  # fmt: skip
 
 
 def compare_groups(

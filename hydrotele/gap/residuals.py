@@ -164,10 +164,10 @@ def _spread(evidence: Evidence, guess: Guess) -> tuple[float, str]:
 
 
 def _calibrated(guess: Guess) -> set[int]:
-    """Places of numbers that belong to a calibration: they may take up what runs differ by."""
+    """Places of numbers of a calibration, and of those of some runs only: they may take up what runs differ by."""
     found, first = set(), 0
     for hypothesis, deviation in guess.parts:
-        if hypothesis.name == CALIBRATION:
+        if hypothesis.name == CALIBRATION or hypothesis.runs:
             found |= set(range(first, first + len(deviation)))
         first += len(deviation)
     return found
@@ -226,11 +226,13 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
     return replace(run, reading=reading)
 
 
-def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track], each: Callable = map) -> tuple[Track, ...]:
+def perfect_tracks(
+    machines: Sequence[Machine], data: Dataset, tracks: Sequence[Track], each: Callable = map
+) -> tuple[Track, ...]:
     """Tracks of a model on readings that it made itself.
 
     Args:
-        machine: the model.
+        machines: the model in each run.
         data: the dataset.
         tracks: the model's tracks of the runs to take after.
         each: `map`, or that of a pool.
@@ -240,8 +242,8 @@ def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track], eac
     """
 
     def one(k: int) -> Track:
-        run = clean_run(machine, data, tracks[k].run, tracks[k].states[0], _SEED + k)
-        return track_run(machine, data, run)
+        run = clean_run(machines[k], data, tracks[k].run, tracks[k].states[0], _SEED + k)
+        return track_run(machines[k], data, run)
 
     return tuple(each(one, range(len(tracks))))
 
