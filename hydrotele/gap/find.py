@@ -26,7 +26,7 @@ from hydrotele.gap.description import describe, effect_title, learned_laws
 from hydrotele.gap.discover import LEARNED, Discovery, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
-from hydrotele.gap.heldout import compare_heldout
+from hydrotele.gap.heldout import HeldOut, compare_heldout
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
@@ -59,7 +59,13 @@ from hydrotele.gap.result import (
     VerdictExplanation,
 )
 from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
-from hydrotele.gap.run_differences import NUISANCE, RunDifference, between_run_differences, difference_words
+from hydrotele.gap.run_differences import (
+    NUISANCE,
+    between_run_differences,
+    difference_words,
+    list_quantities,
+    widen_to_new_run,
+)
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
@@ -160,10 +166,11 @@ def find_gap(
     try:
         found = find(evidence, candidates, tell)
         discovery = Discovery(found.judged, ())
-        differing: tuple[RunDifference, ...] = ()
+        heldout = HeldOut(found, {}, ())
         if method == "regression":
             tell("compare the held-out run with the fitted runs", 0.92)
-            found, differing = compare_heldout(evidence, found, candidates)
+            heldout = compare_heldout(evidence, found, candidates)
+            found = heldout.found
             discovery = Discovery(found.judged, ())
         if lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
@@ -199,7 +206,8 @@ def find_gap(
         scatter = tests.get("constancy", {}).get("value", 1.0)
         covariance = posterior_covariance(evidence, told.guess, scatter)
         spread = np.sqrt(np.diag(covariance))
-        method_notes = [difference_words(d) for d in (*between_run_differences(told.guess, covariance), *differing)]
+        differences = (*between_run_differences(told.guess, covariance, heldout.spread), *heldout.differences)
+        method_notes = [difference_words(d) for d in differences]
         if method == "regression":
             method_notes += [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
@@ -233,8 +241,11 @@ def find_gap(
     if jitter[0] != jitter[1] and data.sensors:
         patched = with_value(patched, f"sensors.{data.sensors}.jitter", jitter[0])
     posterior = None
-    if named or calibration or opened:
-        posterior = _sample_posterior(data, given, opened, (discovery.judged.guess, covariance), judge.levels)
+    if named or calibration or opened or differences:
+        fits = widen_to_new_run(
+            discovery.judged.guess, covariance, data.machine, list_quantities(data.machine, candidates)
+        )
+        posterior = _sample_posterior(data, given, opened, fits, judge.levels)
     return Gap(
         machine=given,
         patched=patched,
@@ -274,6 +285,7 @@ def find_gap(
             traces,
         ),
         posterior=posterior,
+        differences=differences,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
@@ -677,7 +689,11 @@ def _all_calibrated(
 
 
 def _sample_posterior(
-    data: Dataset, given: Machine, opened: FreeCalibration | None, fit: tuple[Guess, np.ndarray], levels: Levels
+    data: Dataset,
+    given: Machine,
+    opened: FreeCalibration | None,
+    found: Sequence[tuple[Guess, np.ndarray]],
+    levels: Levels,
 ) -> Posterior | None:
     """Draw samples of all parameters that the search, and a calibration before it (`opened`), changed."""
     noise = {channel: float(s) for channel, s in zip(data.channels, levels.whole_noise, strict=True)}
@@ -686,7 +702,7 @@ def _sample_posterior(
     jitter = _jitter(data, levels)
     if jitter[0] != jitter[1] and data.sensors:
         machine = with_value(machine, f"sensors.{data.sensors}.jitter", jitter[0])
-    fits = [(opened.guess, opened.covariance), fit] if opened else [fit]
+    fits = [(opened.guess, opened.covariance), *found] if opened else found
     return sample_posterior(machine, fits, noise)
 
 

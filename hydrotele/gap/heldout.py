@@ -7,29 +7,40 @@ has in addition.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.estimate.evidence import Evidence, invert_information
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, Guess, Hypothesis
 from hydrotele.gap.disturbances import acts_for_a_while
 from hydrotele.gap.model_search import Model, add_effects, settle, settle_noise
-from hydrotele.gap.run_differences import RunDifference, between_runs, difference_in_run, list_quantities
+from hydrotele.gap.result import RunDifference
+from hydrotele.gap.run_differences import between_runs, difference_in_run, list_quantities
 from hydrotele.gap.search import Found
 
 
-def compare_heldout(
-    evidence: Evidence, found: Found, candidates: Sequence[Hypothesis]
-) -> tuple[Found, tuple[RunDifference, ...]]:
+class HeldOut(NamedTuple):
+    """The held-out run compared with the fitted runs.
+
+    Attributes:
+        found: the accepted model, with this run's parameters.
+        spread: parameter that differs between runs -> standard deviation of this run's normalised deviation.
+        differences: of this run alone.
+    """
+
+    found: Found
+    spread: dict[str, float]
+    differences: tuple[RunDifference, ...]
+
+
+def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypothesis]) -> HeldOut:
     """Estimate the held-out run's part of an accepted model, and find what differs in this run alone.
 
     Args:
         evidence: of the fitted runs.
         found: the accepted model.
         candidates: the effects.
-
-    Returns:
-        The model with the held-out run's parameters, and the differences of this run from the fitted ones.
     """
     run, data = evidence.data.heldout, evidence.data
     free = [_only(h, d, run.name) for h, d in found.guess.parts]
@@ -37,21 +48,27 @@ def compare_heldout(
     try:
         now = settle(other, Model(settle_noise(other, other.judged(Guess(tuple(free))))))
         found = replace(found, judged=replace(found.judged, guess=_with_run(found.guess, now.guess, run.name)))
+        spread = {}
+        if now.fit:
+            known, first = np.sqrt(np.diag(invert_information(now.fit.information))), 0
+            for h, d in now.guess.parts:
+                spread |= {h.location: float(known[first])} if h.name == BETWEEN_RUNS else {}
+                first += len(d)
         held = Model(replace(now.judged, guess=Guess(tuple((h.held(d), np.zeros(0)) for h, d in now.guess.parts))))
         other.set_base(held.judged)
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if acts_for_a_while(c)]
         rounds, _ = add_effects(other, held, [*alone, *pulses], {}, lambda text, share: None)
         if not rounds:
-            return found, ()
+            return HeldOut(found, spread, ())
         last = rounds[-1].after
         assert last.fit
-        spread, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []
+        sizes, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []
         for h, d in last.guess.parts:
             if h.size:
-                differences.append(difference_in_run(h, d, spread[first : first + h.size], run.name))
+                differences.append(difference_in_run(h, d, sizes[first : first + h.size], run.name))
             first += h.size
-        return found, tuple(differences)
+        return HeldOut(found, spread, tuple(differences))
     finally:
         other.close()
 

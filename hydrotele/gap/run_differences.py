@@ -17,14 +17,16 @@ from scipy.stats import t as student_t
 
 from hydrotele.effects import EFFECTS, Parameter
 from hydrotele.estimate.evidence import Fit, Judged, invert_information
-from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, numbers
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration, numbers
 from hydrotele.gap.dictionary import AMPLITUDES, Dictionary
 from hydrotele.gap.regression import NormalEquations, compare_groups, split_columns
+from hydrotele.gap.result import RunDifference
 from hydrotele.logs.dataset import RunData
 from hydrotele.machine.machine import Machine
 
 NUISANCE = (CALIBRATION, BETWEEN_RUNS)
 """Hypotheses that are no effects to be named."""
+_NORMAL95 = 1.96  # half-width of a 95 % interval in standard deviations
 _EM_ROUNDS = 50  # of the scale between runs; each costs microseconds
 
 
@@ -205,7 +207,9 @@ def rescale_between_runs(judged: Judged, fit: Fit, runs: Sequence[RunData]) -> t
     groups, first = [], 0
     for index, (h, _) in enumerate(guess.parts):
         if h.name == BETWEEN_RUNS:
-            groups.append((index, [first + k for k, run in enumerate(h.parameters) if run in names], first, h.size))
+            own = [first + k for k, run in enumerate(h.parameters) if run in names]
+            if len(own) > 1:  # one run says nothing of a scatter
+                groups.append((index, own, first, h.size))
         first += h.size
     if not groups:
         return judged, fit
@@ -235,28 +239,7 @@ def rescale_between_runs(judged: Judged, fit: Fit, runs: Sequence[RunData]) -> t
 # -- result -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RunDifference:
-    """A parameter that differs between runs, or a difference of one run from all others.
-
-    Attributes:
-        name: of the parameter, such as `viscous_friction.boom.viscous`, or of a disturbance and its drive.
-        unit: SI.
-        deviation: standard deviation between runs [unit]; NaN of a difference of one run.
-        runs: run -> its difference from the common value and the standard deviation of that [unit].
-        reach: half-width of the 95 % interval of the difference of a new run [unit]; NaN of one run's.
-        details: other parameters of a disturbance, such as its start, in words.
-    """
-
-    name: str
-    unit: str
-    deviation: float
-    runs: Mapping[str, tuple[float, float]]
-    reach: float = math.nan
-    details: str = ""
-
-
-def between_run_differences(guess: Guess, covariance: np.ndarray) -> list[RunDifference]:
+def between_run_differences(guess: Guess, covariance: np.ndarray, heldout: Mapping[str, float]) -> list[RunDifference]:
     """Return the parameters of a model that differ between runs.
 
     A new run's difference follows Student's distribution with as many degrees of freedom as there are fitted runs,
@@ -264,7 +247,8 @@ def between_run_differences(guess: Guess, covariance: np.ndarray) -> list[RunDif
 
     Args:
         guess: the model.
-        covariance: (P, P) of its normalised deviations; a run without information has a variance of 1.
+        covariance: (P, P) of its normalised deviations, from the fitted runs.
+        heldout: parameter -> standard deviation of the held-out run's normalised deviation.
     """
     found, first = [], 0
     variances = np.diag(covariance)
@@ -273,12 +257,13 @@ def between_run_differences(guess: Guess, covariance: np.ndarray) -> list[RunDif
         first += h.size
         if h.name != BETWEEN_RUNS:
             continue
-        (p,) = {id(p): p for p in h.parameters.values()}.values()
+        p, last = next(iter(h.parameters.values())), h.size - 1  # the held-out run is the last one
+        spread = np.append(np.sqrt(own[:last]), heldout.get(h.location, 1.0))
         table = {
-            run: (float(d * p.prior_std), float(np.sqrt(v) * p.prior_std))
-            for run, d, v in zip(h.parameters, deviation, own, strict=True)
+            run: (float(d * p.prior_std), float(sd * p.prior_std))
+            for run, d, sd in zip(h.parameters, deviation, spread, strict=True)
         }
-        reach = p.prior_std * float(student_t.ppf(0.975, max(1, len(table) - 1)))
+        reach = p.prior_std * float(student_t.ppf(0.975, last))
         found.append(RunDifference(h.location, p.unit, p.prior_std, table, reach))
     return found
 
@@ -320,3 +305,40 @@ def difference_words(d: RunDifference) -> str:
         f"{d.name} differs between the runs by a standard deviation of {d.deviation:.3g} {d.unit} ({each})."
         f" For a new run its 95 % interval is the common value +- {d.reach:.3g} {d.unit}."
     )
+
+
+def widen_to_new_run(
+    guess: Guess, covariance: np.ndarray, machine: Machine, quantities: Mapping[str, Quantity]
+) -> list[tuple[Guess, np.ndarray]]:
+    """Add the scatter between runs to the covariance of a fit, so that it holds for a new run.
+
+    Args:
+        guess: the model.
+        covariance: (P, P) of its normalised deviations.
+        machine: the given machine.
+        quantities: parameters that may differ.
+
+    Returns:
+        Independent fits with their covariances: parameters that have only a scatter, and the model.
+    """
+    widened, group, names = covariance.copy(), calibration(machine), guess.names
+    sizes = [p.prior_std for h in guess.hypotheses for p in h.parameters.values()]
+    extra: list[tuple[Guess, np.ndarray]] = []
+    scattered: list[tuple[str, float]] = []
+    for difference in between_run_differences(guess, covariance, {}):
+        key, std = difference.name, difference.reach / _NORMAL95
+        own = next((k for k, n in enumerate(names) if n in (key, f"{CALIBRATION}.all.{key}")), None)
+        if own is not None:
+            widened[own, own] += (std / sizes[own]) ** 2
+        elif key in group.parameters:
+            scattered.append((key, std))
+        else:
+            name, location = effect_of(key)
+            p = quantities[key].parameter
+            part = Hypothesis(name, location, {key.rpartition(".")[2]: p}), np.zeros(1)
+            extra.append((Guess((part,)), np.array([[(std / p.prior_std) ** 2]])))
+    if scattered:
+        part = replace(group, parameters={key: group.parameters[key] for key, _ in scattered}), np.zeros(len(scattered))
+        scatter = [(std / group.parameters[key].prior_std) ** 2 for key, std in scattered]
+        extra.append((Guess((part,)), np.diag(scatter)))
+    return [*extra, (guess, widened)]
