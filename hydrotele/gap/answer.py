@@ -23,7 +23,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "leakage": ("internal_leakage", "tank_leakage", "orifice_leakage"),
     "compliance": ("hose_compliance", "bulk_modulus", "entrained_air", "joint_flexibility", "backlash"),
     "inertia": ("com_offset", "inertia_error", "payload", "base_tilt"),
-    "external force": ("external_force", "force_pulse", "end_stop_stiffness"),
+    "external force": ("external_force", "force_pulse", "periodic_force", "end_stop_stiffness"),
 }  # fmt: skip
 """Family -> names of effects, where the part of the model that an effect changes is not its family."""
 

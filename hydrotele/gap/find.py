@@ -208,6 +208,10 @@ def find_gap(
         spread = np.sqrt(np.diag(covariance))
         differences = (*between_run_differences(told.guess, covariance, heldout.spread), *heldout.differences)
         method_notes = [difference_words(d) for d in differences]
+        method_notes += [
+            f"{h.name} of {h.location} acts in {', '.join(h.runs)}; the corrected machine does not contain it."
+            for h in told.guess.hypotheses if h.runs and h.name not in NUISANCE
+        ]  # fmt: skip
         if method == "regression":
             method_notes += [profile_words(p) for p in find_profiles(evidence, told)]
         shares = judge.shares(discovery, before, after, floor, evidence.map)
@@ -489,11 +493,16 @@ def _named(found: Found, last: Guess, spread: np.ndarray, shares: Mapping) -> tu
         chance, others = _chances(found, index, rest)
         trust = _trust(found, rest)
         chance *= trust
+        fitted = {track.run.name for track in found.judged.tracks}
+        estimates = {
+            key: estimate for key, estimate in _estimates(hypothesis, deviation, own).items()
+            if hypothesis.run_of(key) in fitted | {""}
+        }  # fmt: skip
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
             NamedEffect(
                 hypothesis.name, hypothesis.location, chance,
-                _estimates(hypothesis, deviation, own), others, shares[hypothesis.key],
+                estimates, others, shares[hypothesis.key],
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda effect: -effect.probability))

@@ -46,7 +46,10 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
     free = [_only(h, d, run.name) for h, d in found.guess.parts]
     other = Evidence(data, (run,), 1, evidence.step, lacking=True)
     try:
-        now = settle(other, Model(settle_noise(other, other.judged(Guess(tuple(free))))))
+        own = other.set_base(Guess(tuple(free)))
+        if (levels := found.judged.tracks[0].levels).colours:
+            own = other.set_base(other.judged_from(own.guess, levels))
+        now = settle(other, Model(settle_noise(other, own)))
         found = replace(found, judged=replace(found.judged, guess=_with_run(found.guess, now.guess, run.name)))
         spread = {}
         if now.fit:
@@ -59,10 +62,9 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if acts_for_a_while(c)]
         rounds, _ = add_effects(other, held, [*alone, *pulses], {}, lambda text, share: None)
-        if not rounds:
+        last = rounds[-1].after if rounds else held
+        if not last.fit:  # nothing, or coloured noise
             return HeldOut(found, spread, ())
-        last = rounds[-1].after
-        assert last.fit
         sizes, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []
         for h, d in last.guess.parts:
             if h.size:
