@@ -780,7 +780,7 @@ def _most_likely(
 
     period = min(track.run.period for track in tracks)
     least = prior.low.copy()
-    least[own] = _WHITE_LEFT * prior.noise[own]
+    least[own] = np.minimum(_WHITE_LEFT * prior.noise, least)[own]  # a constant channel has less noise than stated
     tint_low = [0.5 * _FAINT * _WHITE_LEFT * prior.noise[k] for k in own]
     low = np.concatenate([least, LEAST * largest, floor, tint_low, [_LEAST_JITTER * period]])
     high = np.concatenate([

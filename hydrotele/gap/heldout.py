@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.estimate.evidence import Evidence, invert_information
-from hydrotele.estimate.hypothesis import BETWEEN_RUNS, Guess, Hypothesis
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.gap.disturbances import acts_for_a_while
 from hydrotele.gap.model_search import Model, add_effects, settle, settle_noise
 from hydrotele.gap.result import RunDifference
@@ -57,7 +57,11 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
             for h, d in now.guess.parts:
                 spread |= {h.location: float(known[first])} if h.name == BETWEEN_RUNS else {}
                 first += len(d)
-        held = Model(replace(now.judged, guess=Guess(tuple((h.held(d), np.zeros(0)) for h, d in now.guess.parts))))
+        parts = list(now.guess.parts)
+        if all(h.name != CALIBRATION for h, _ in parts):  # its parameters are tried one by one
+            group = calibration(data.machine)
+            parts.append((group, np.zeros(group.size)))
+        held = Model(replace(now.judged, guess=Guess(tuple((h.held(d), np.zeros(0)) for h, d in parts))))
         other.set_base(held.judged)
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if acts_for_a_while(c)]

@@ -93,7 +93,8 @@ def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
 
 def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
-    w, window = settled(whitened, period), max(2, round(_WINDOW / period))
+    w = settled(whitened, period)
+    window = min(max(2, round(_WINDOW / period)), len(w))  # a shorter run is one window
     there = np.isfinite(w)
     count = there.sum(axis=0).astype(float)
     w = np.where(there, w, 0.0)
