@@ -6,7 +6,7 @@ modulus, so that a small machine is stiff.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,9 +81,9 @@ def _times(value: Any, factor: float) -> Any:
 
 def simulate_data(
     truth: Machine, channels: tuple[str, ...], noise: dict[str, float], model: Machine | None = None,
-    period: float = 0.02, rows: int = 400, noise_stated: bool = False,
+    period: float = 0.02, rows: int = 400, noise_stated: bool = False, own: Sequence[Machine] = (),
 ) -> Dataset:  # fmt: skip
-    """Simulate two runs of a machine with the reduced model, and return them as a dataset.
+    """Simulate runs of a machine with the reduced model, and return them as a dataset.
 
     Args:
         truth: machine that is simulated.
@@ -93,6 +93,7 @@ def simulate_data(
         period: of the rows [s].
         rows: of each run.
         noise_stated: whether the dataset states the noise.
+        own: the machine of each run; by default two runs of `truth`.
 
     Returns:
         The dataset; the first run is held out.
@@ -101,7 +102,7 @@ def simulate_data(
     assert truth.supply
     sizes = np.array([noise[c.partition(".")[0]] for c in channels])
     time, runs = period * np.arange(rows), []
-    for seed in range(2):
+    for seed, true in enumerate(own or (truth, truth)):
         command = np.column_stack(
             [0.4 * np.sin((1.1 + 0.4 * k + 0.13 * seed) * time / (50.0 * period) + k) for k in range(len(axes))]
         )
@@ -112,7 +113,7 @@ def simulate_data(
                 state[s] = truth.home.get(place, 0.0)
             elif kind.startswith("pressure"):
                 state[s] = 0.3 * truth.supply.relief_pressure
-        simulated, steps = reduced_model(truth, channels), steps_per_row(truth, period, 0.5e-3)
+        simulated, steps = reduced_model(true, channels), steps_per_row(true, period, 0.5e-3)
         shown, states = np.empty((rows, len(channels))), np.empty((rows, len(names)))
         simulate_rows(simulated, model_space(simulated), state, command, period, steps, shown, states)
         shown += np.random.default_rng(seed).normal(size=shown.shape) * sizes

@@ -9,7 +9,7 @@ How well the numbers of named effects are known: noise, run-to-run scatter, inte
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -134,10 +134,16 @@ class Evidence:
         """End the workers; what has not begun is dropped."""
         self._pool.shutdown(cancel_futures=True)
 
-    def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
-        """Tracks with gains of their own and the levels that the machine states."""
-        runs = self.runs if runs is None else runs
-        return tuple(self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs))
+    def track(self, machine: Machine, own: Mapping[str, Machine]) -> tuple[Track, ...]:
+        """Tracks with gains of their own and the levels that the machine states.
+
+        Args:
+            machine: that the runs share.
+            own: run -> machine where it differs.
+        """
+        return tuple(self._pool.map(
+            lambda run: track_run(own.get(run.name, machine), self.data, run, None, self.step), self.runs
+        ))  # fmt: skip
 
     def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
         """A guess with noise levels of its own, found from those of the base.
@@ -149,16 +155,18 @@ class Evidence:
         Outside the model's domain the likelihood is zero: the tracks of the base, an infinite loss.
         """
         try:
-            machine = guess.machine(self.data.machine)
+            machine, own = guess.machines(self.data.machine)
         except DomainError:
             if not self.tracks:
                 raise
             return Judged(guess, self.tracks, np.inf)
         if not self.lacking:
-            tracks = self.track(machine)
+            tracks = self.track(machine, own)
         else:
             rounds = 1 + reopened if self.tracks else _ROUNDS
-            tracks = find_levels(self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened)
+            tracks = find_levels(
+                self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened, own
+            )
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)
 
@@ -169,14 +177,16 @@ class Evidence:
         Unknown inputs that the given levels lack are tried, too.
         """
         try:
-            machine = guess.machine(self.data.machine)
+            machine, own = guess.machines(self.data.machine)
         except DomainError:
             return Judged(guess, self.tracks, np.inf)
-        tracks = self.map(
-            lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
-            self.tracks,
-        )
-        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True)
+
+        def cross(near: Track) -> Track:
+            there = own.get(near.run.name, machine)
+            return track_run(there, self.data, near.run, None, self.step, levels, None, True, near.rest)
+
+        tracks = self.map(cross, self.tracks)
+        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True, own=own)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)
 
@@ -184,8 +194,8 @@ class Evidence:
         """A guess with instants that jitter, if its readings tell so; else as given."""
         if not self.lacking:
             return judged
-        machine = judged.guess.machine(self.data.machine)
-        tracks = with_jitter(self.data, machine, judged.tracks, self.map, self.step)
+        machine, own = judged.guess.machines(self.data.machine)
+        tracks = with_jitter(self.data, machine, judged.tracks, self.map, self.step, own)
         if tracks is judged.tracks:
             return judged
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
@@ -217,20 +227,20 @@ class Evidence:
         step = step or self.step
         tracks = self.tracks if tracks is None else tracks
         try:
-            machine = guess.machine(self.data.machine)
+            machine, own = guess.machines(self.data.machine)
         except DomainError:
             return np.full(sum(track.whitened.size for track in tracks), _CLIP)
 
         def one(track: Track) -> np.ndarray:
-            return self._errors(machine, track, step) + self._made_by(step, track)
+            return self._errors(own.get(track.run.name, machine), track, step) + self._made_by(step, track)
 
         return np.concatenate(self.map(one, tracks) if parallel else [one(t) for t in tracks])
 
     def step_effect(self, guess: Guess, step: float) -> np.ndarray:
         """(E,) what another step than the evidence's own changes for a guess near the base."""
-        machine = guess.machine(self.data.machine)
 
         def one(track: Track) -> np.ndarray:
+            machine = guess.machine(self.data.machine, track.run.name)
             return self._errors(machine, track, step) - self._errors(machine, track, self.step)
 
         return np.concatenate(self.map(one, self.tracks))
@@ -244,7 +254,7 @@ class Evidence:
             return 0.0
         key = f"{track.run.name} {len(track.whitened)}", step
         if key not in self._steps:
-            machine = self._base.machine(self.data.machine)
+            machine = self._base.machine(self.data.machine, track.run.name)
             self._steps[key] = flat(track.whitened) - self._errors(machine, track, step)
         return self._steps[key]
 
@@ -274,19 +284,26 @@ class Evidence:
         Differences are taken to the other side where the first one is outside the model's domain; 0 where
         both are.
         """
-        nudges, machine = guess.nudges(), self.data.machine
+        nudges, machine, runs = guess.nudges(), self.data.machine, guess.parameter_runs
         linear = self._linear_slopes(guess)
 
         def column(index: int) -> np.ndarray:
             if index in linear:
                 return linear[index]
+            found = np.zeros(len(errors))
+            acts = [not runs[index] or track.run.name in runs[index] for track in self.tracks]
+            rows = np.repeat(acts, [track.whitened.size for track in self.tracks])
+            if not rows.any():
+                return found
             for nudge in (nudges[index], -nudges[index]):
                 moved = guess.deviation
                 moved[index] += nudge
                 there = guess.at(moved)
                 if np.array_equal(there.deviation, moved) and there.is_in_domain(machine):
-                    return (self.errors(there, step) - errors) / nudge
-            return np.zeros(len(errors))
+                    tracks = [track for track, own in zip(self.tracks, acts, strict=True) if own]
+                    found[rows] = (self.errors(there, step, tracks) - errors[rows]) / nudge
+                    break
+            return found
 
         columns = range(first, len(guess.deviation))
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
@@ -679,18 +696,19 @@ def _beyond_dents(evidence: Evidence, guess: Guess, alone: np.ndarray) -> np.nda
 
     def losses(index: int, sizes: Sequence[float]) -> np.ndarray:
         """(K, 2) of the loss, for K sizes of a move of a number to either side."""
-        machines = []
+        guesses = []
         for move in np.outer(sizes, (1.0, -1.0)).ravel():
             moved = here.copy()
             moved[index] += move * alone[index]
-            machines.append(guess.at(moved).machine(evidence.data.machine))
+            guesses.append(guess.at(moved))
 
-        def one(pair: tuple[Machine, Track]) -> float:
-            machine, track = pair
+        def one(pair: tuple[Guess, Track]) -> float:
+            moved, track = pair
+            machine = moved.machine(evidence.data.machine, track.run.name)
             return track_run(machine, evidence.data, track.run, None, step, track.levels,
                              rest=track.rest).loss  # fmt: skip
 
-        pairs = [(machine, track) for machine in machines for track in evidence.tracks]
+        pairs = [(moved, track) for moved in guesses for track in evidence.tracks]
         return np.reshape(evidence.map(one, pairs), (len(sizes), 2, -1)).sum(axis=2)
 
     for hypothesis, deviation in guess.parts:

@@ -12,7 +12,7 @@ remains after that.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -52,20 +52,27 @@ class Hypothesis:
     or the supply has the same width and the tails of a t distribution: there `scale` says what is
     common, and what is rare, as an inertia ten times the model's, is no reason to prefer three
     other effects of common size.
+
+    With `runs`, it acts in these runs only. A parameter `RUN` or `RUN: NAME` belongs to that run alone.
     """
 
     name: str
     location: str
     parameters: dict[str, Parameter]
     change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
+    runs: tuple[str, ...] = field(default=(), kw_only=True)
 
-    def machine(self, nominal: Machine, deviation: np.ndarray) -> Machine:
-        """Return the machine that has it, at a deviation (p,).
+    def machine(self, nominal: Machine, deviation: np.ndarray, run: str = "") -> Machine:
+        """Return the machine that has it, at a deviation (p,), in a run; by default what all runs share.
 
         Raises:
             DomainError: the machine with these values is not valid.
         """
+        if self.runs and run not in self.runs:
+            return nominal
         values = self.values(deviation)
+        if self.runs:
+            values = {key: value for key, value in values.items() if self.run_of(key) in ("", run)}
         try:
             if self.change:
                 return self.change(nominal, values)
@@ -75,6 +82,10 @@ class Hypothesis:
         except (ValueError, ArithmeticError) as error:  # of the machine file's validation, or of an effect's formula
             stated = ", ".join(f"{key} = {value:.6g}" for key, value in values.items())
             raise DomainError(f"{self.name} at {self.location}", f"{stated} is not possible: {error}") from error
+
+    def run_of(self, key: str) -> str:
+        """Return the run to which a parameter belongs; empty if to all of its runs."""
+        return next((run for run in self.runs if key == run or key.startswith(f"{run}: ")), "")
 
     @property
     def size(self) -> int:
@@ -150,7 +161,7 @@ class Hypothesis:
 
     def held(self, deviation: np.ndarray) -> "Hypothesis":
         """The same with its numbers fixed at a deviation (p,): none is left to fit."""
-        return replace(self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation))
+        return _Held(self.name, self.location, {}, self.change, self, deviation, runs=self.runs)
 
     def responses(self, machine: Machine, data: "Dataset", track: "Track") -> np.ndarray | None:
         """Return the change (n c, p) of a track's whitened errors per deviation, or None if it must be simulated.
@@ -168,6 +179,19 @@ class Hypothesis:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
         step = np.minimum(size, 0.1 * (self.high - self.low))
         return np.where(deviation + step > self.high, -step, step)
+
+
+@dataclass(frozen=True)
+class _Held(Hypothesis):
+    """A hypothesis whose parameters are fixed."""
+
+    origin: Hypothesis | None = None
+    fixed: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def machine(self, nominal: Machine, deviation: np.ndarray, run: str = "") -> Machine:
+        """Return the machine at the fixed deviation."""
+        assert self.origin
+        return self.origin.machine(nominal, self.fixed, run)
 
 
 def hypotheses(machine: Machine, names: Sequence[str] = ()) -> list[Hypothesis]:
@@ -331,29 +355,50 @@ class Guess:
         steps = [h.nudges(d, size) for h, d in self.parts]
         return np.concatenate(steps) if steps else np.zeros(0)
 
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Runs in which the machine differs from what all runs share."""
+        return tuple(dict.fromkeys(run for h, _ in self.parts for run in h.runs))
+
+    @property
+    def parameter_runs(self) -> list[tuple[str, ...]]:
+        """(P,) runs on which each parameter acts; empty for all runs."""
+        return [(run,) if (run := h.run_of(key)) else h.runs for h in self.hypotheses for key in h.parameters]
+
     def is_in_domain(self, nominal: Machine) -> bool:
-        """Return whether the machine with all these effects is valid."""
+        """Return whether the machine with all these effects is valid, in every run."""
         try:
-            self.machine(nominal)
+            for run in ("", *self.runs):
+                self.machine(nominal, run)
         except DomainError:
             return False
         return True
 
-    def machine(self, nominal: Machine) -> Machine:
-        """Return the machine that has all these effects.
+    def machine(self, nominal: Machine, run: str = "") -> Machine:
+        """Return the machine that has all these effects in a run; by default what all runs share.
 
         Raises:
             DomainError: it is not valid.
         """
-        for hypothesis, deviation in self.parts:
-            nominal = hypothesis.machine(nominal, deviation)
+        for hypothesis, deviation in sorted(self.parts, key=lambda part: bool(part[0].runs)):
+            nominal = hypothesis.machine(nominal, deviation, run)
         return nominal
+
+    def machines(self, nominal: Machine) -> tuple[Machine, dict[str, Machine]]:
+        """Return the machine that all runs share, and run -> machine where it differs.
+
+        Raises:
+            DomainError: one of them is not valid.
+        """
+        return self.machine(nominal), {run: self.machine(nominal, run) for run in self.runs}
 
 
 CALIBRATION = "calibration"
 """Name of the hypothesis that holds all uncertain numbers."""
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""
+BETWEEN_RUNS = "between_runs"
+"""Name of hypotheses that let one parameter differ from run to run; the location is the parameter."""
 
 # Relative standard deviation of what a data sheet, a drawing or a workshop says.
 UNCERTAINTY: dict[str, float] = {

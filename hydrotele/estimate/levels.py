@@ -18,7 +18,7 @@ one pass, and the disturbances themselves, which say where and when the model la
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -455,7 +455,7 @@ def noise_prior(data: Dataset) -> Prior:
 def find_levels(
     data: Dataset, machine: Machine, start: Sequence[Track] = (), each: Callable = map,
     step: float = STEP, rounds: int = 3, same: bool = False,
-    reopened: bool = False,
+    reopened: bool = False, own: Mapping[str, Machine] | None = None,
 ) -> tuple[Track, ...]:  # fmt: skip
     """Levels of the largest posterior probability, given a machine.
 
@@ -469,6 +469,7 @@ def find_levels(
         rounds: how often levels are found, each time about the tracks of the time before.
         same: whether `start` is of nearly the same machine, so that its Jacobians will do.
         reopened: whether inputs that `start` lacks are tried again.
+        own: run -> machine where it differs from that of all runs, with the same states.
 
     Returns:
         Tracks of the fit runs with these levels, linearised. Where the filter of a machine like that of
@@ -481,18 +482,18 @@ def find_levels(
     if start:
         levels = start[0].levels
         levels = _reopened(levels, machine) if reopened else _possible(levels, machine)
-        tracks = _crossed(data, machine, levels, start, each, step, same)
+        tracks = _crossed(data, machine, levels, start, each, step, same, own)
         if not np.isfinite(_whole(tracks)):
             return tracks
     else:
         noise = np.clip(prior.noise, prior.low, prior.high)
         held = [n for n in _white_states(machine, state_names(machine)) if n.startswith("position")]
         rough = Levels(noise, drift={**_LOOSE, **dict.fromkeys(held, _LOOSE_POSITION)})
-        tracks = _crossed(data, machine, rough, (), each, step)
+        tracks = _crossed(data, machine, rough, (), each, step, own=own)
         check_filter_follows(tracks, data.channels)
         inputs = possible_inputs(machine)
         levels = Levels(noise, inputs, 0.01 * input_sizes(machine, inputs))
-        tracks = _crossed(data, machine, levels, tracks, each, step)
+        tracks = _crossed(data, machine, levels, tracks, each, step, own=own)
         check_filter_follows(tracks, data.channels)
     best = tracks
     for index in range(rounds):
@@ -501,14 +502,14 @@ def find_levels(
         near = (bool(start) or index > 0) and not _has_gap(machine)
         for part in _PARTS:  # where a filter hardly follows, its linear form misleads
             levels = _pruned(_between(old, wanted, part), machine)
-            tracks = _crossed(data, machine, levels, before, each, step, near)
+            tracks = _crossed(data, machine, levels, before, each, step, near, own)
             if _whole(tracks) < _whole(before) or not _has_gap(machine):
                 break
         if _whole(tracks) < _whole(best):
             best = tracks
         if _whole(tracks) > _whole(before) - _SETTLED:
             break
-    return best if start else with_jitter(data, machine, best, each, step)
+    return best if start else with_jitter(data, machine, best, each, step, own)
 
 
 class CannotFollowError(InputError):
@@ -560,7 +561,7 @@ def describe_lost_track(track: Track, channels: Sequence[str]) -> str:
 
 def with_jitter(
     data: Dataset, machine: Machine, tracks: tuple[Track, ...], each: Callable = map,
-    step: float = STEP,
+    step: float = STEP, own: Mapping[str, Machine] | None = None,
 ) -> tuple[Track, ...]:  # fmt: skip
     """The same with instants that jitter, if that is clearly likelier and all channels say so.
 
@@ -574,6 +575,7 @@ def with_jitter(
         tracks: its linearised tracks of the fit runs.
         each: such as `map`, perhaps on several workers.
         step: largest step of the integrator [s].
+        own: run -> machine where it differs.
 
     Returns:
         Tracks with a jitter that was found, or the given ones.
@@ -585,7 +587,7 @@ def with_jitter(
     if wanted.jitter < 2.0 * _LEAST_JITTER * period:
         return tracks
     wanted = _pruned(wanted, machine)
-    found = _crossed(data, machine, wanted, tracks, each, step, not _has_gap(machine))
+    found = _crossed(data, machine, wanted, tracks, each, step, not _has_gap(machine), own)
     likelier = _whole(found) < _whole(tracks) - (0.0 if levels.jitter else _JITTERS)
     return found if likelier and _agree_on_jitter(found) else tracks
 
@@ -664,7 +666,7 @@ def _pruned(levels: Levels, machine: Machine) -> Levels:
 
 def _crossed(
     data: Dataset, machine: Machine, levels: Levels, near: Sequence[Track], each: Callable,
-    step: float, same: bool = False,
+    step: float, same: bool = False, own: Mapping[str, Machine] | None = None,
 ) -> tuple[Track, ...]:  # fmt: skip
     """Linearised tracks with some levels; what inputs do is taken from tracks nearby.
 
@@ -674,12 +676,13 @@ def _crossed(
 
     def cross(index: int) -> Track:
         run, columns, flow = data.fit[index], None, None
+        there = (own or {}).get(run.name, machine)
         rest = near[index].rest if near else None
         if same:
             columns, flow = _without_pruned(near[index], levels.inputs)
         elif near and levels.inputs:
-            columns = columns_of(machine, near[index], levels.inputs)
-        return track_run(machine, data, run, None, step, levels, columns, True, rest, flow)
+            columns = columns_of(there, near[index], levels.inputs)
+        return track_run(there, data, run, None, step, levels, columns, True, rest, flow)
 
     return tuple(each(cross, range(len(data.fit))))
 
@@ -777,7 +780,7 @@ def _most_likely(
 
     period = min(track.run.period for track in tracks)
     least = prior.low.copy()
-    least[own] = _WHITE_LEFT * prior.noise[own]
+    least[own] = np.minimum(_WHITE_LEFT * prior.noise, least)[own]  # a constant channel has less noise than stated
     tint_low = [0.5 * _FAINT * _WHITE_LEFT * prior.noise[k] for k in own]
     low = np.concatenate([least, LEAST * largest, floor, tint_low, [_LEAST_JITTER * period]])
     high = np.concatenate([

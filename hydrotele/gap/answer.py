@@ -27,7 +27,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
         "force_offset", "force_scale", "force_delay", "angle_offset", "length_offset", "angle_delay", "length_delay",
         "clock_offset",
     ),
-    "external force": ("external_force", "force_pulse", "end_stop_stiffness"),
+    "external force": ("external_force", "force_pulse", "periodic_force", "end_stop_stiffness"),
 }  # fmt: skip
 """Family -> names of effects, where the part of the model that an effect changes is not its family."""
 

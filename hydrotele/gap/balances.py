@@ -729,6 +729,6 @@ def _in_band(sets: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _scatter(sets: np.ndarray, period: float) -> np.ndarray:
     square = np.mean((sets[1:] - sets[0]) ** 2, axis=0)
-    width = max(1, round(_AVERAGE / period))
+    width = min(max(1, round(_AVERAGE / period)), len(square))  # a shorter run is averaged as a whole
     edges = np.convolve(np.ones(len(square)), np.ones(width), "same")
     return np.sqrt(np.convolve(square, np.ones(width), "same") / edges)

@@ -262,6 +262,11 @@ def headline(gap: Gap) -> str:
     """The verdict in one line."""
     if gap.verdict == "no_gap":
         within = " within the uncertainty of its parameters" if gap.calibration else ""
+        varying = [d.name.replace("_", " ").replace(".", " ") for d in gap.differences if not math.isnan(d.deviation)]
+        if varying:
+            return (
+                f"Model and machine agree{within}, apart from differences between the runs: {_listed(varying, 'and')}"
+            )
         return f"Model and machine agree{within}"
     if gap.verdict == "partly":
         remainder = "the remaining difference has no known cause"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hydrotele.effects import EFFECTS
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.track import COARSE, Track
@@ -20,6 +21,9 @@ from hydrotele.machine.machine import Machine
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one
 parameter and without stated start values."""
+SCANNED_FRACTIONS = tuple((k + 0.5) / 20.0 for k in range(20))
+"""Places in the range of a parameter at which a custom effect is tried in addition."""
+_LIBRARY = "hydrotele."  # start of the module names of the library's effects
 _MIN_AMPLITUDE = 0.05  # prior standard deviations; a bound that is nearer leaves no room for a difference
 _START_RANGE = (0.3, 3.0)  # multiples of a version's amplitude within which the first refinement starts
 
@@ -31,10 +35,12 @@ class Version:
     Attributes:
         hypothesis: the effect at a location, with p parameters.
         steps: (p, q) normalised parameter deviations of the columns.
+        is_scanned: whether a parameter was set to a place in its range; the refinement starts there.
     """
 
     hypothesis: Hypothesis
     steps: np.ndarray
+    is_scanned: bool = False
 
     @property
     def lengths(self) -> np.ndarray:
@@ -47,6 +53,8 @@ class Version:
         Args:
             mean: (q,) posterior means of the coefficients [prior standard deviations].
         """
+        if self.is_scanned:
+            return self.steps[:, 0]
         ratio = mean / self.lengths
         if len(ratio) == 1 and self.hypothesis.size > 1:
             ratio = np.clip(ratio, *_START_RANGE)
@@ -62,6 +70,7 @@ def list_versions(hypothesis: Hypothesis) -> list[Version]:
     starts = [s for s in hypothesis.starts if np.any(s)]
     for start in starts:
         found.append(Version(hypothesis, start[:, None].astype(float)))
+    found += [Version(hypothesis, step[:, None], True) for step in scan_ranges(hypothesis)]
     for amplitude in AMPLITUDES[: 1 if starts or hypothesis.size > 1 else None]:
         steps = [_room(hypothesis, k, amplitude) for k in range(hypothesis.size)]
         if all(abs(step) >= _MIN_AMPLITUDE for step in steps):
@@ -71,6 +80,25 @@ def list_versions(hypothesis: Hypothesis) -> list[Version]:
         if not any(np.array_equal(version.steps, other.steps) for other in unique):
             unique.append(version)
     return unique
+
+
+def scan_ranges(hypothesis: Hypothesis) -> list[np.ndarray]:
+    """Return deviations (p,) at which each parameter of a custom effect takes values from its whole range.
+
+    Its likelihood may have several maxima between the bounds. The other parameters have the first start value, or a
+    small amplitude. Effects of the library state start values that cover their ranges.
+    """
+    if hypothesis.name not in EFFECTS or EFFECTS[hypothesis.name].apply.__module__.startswith(_LIBRARY):
+        return []
+    starts = [s for s in hypothesis.starts if np.any(s)] or [np.full(hypothesis.size, AMPLITUDES[0])]
+    found = []
+    for k in range(hypothesis.size):
+        low, high = hypothesis.low[k], hypothesis.high[k]
+        for fraction in SCANNED_FRACTIONS if np.isfinite(high - low) else ():
+            step = starts[0].astype(float).copy()
+            step[k] = low + fraction * (high - low)
+            found.append(step)
+    return [step for step in found if np.any(step)]
 
 
 def _room(hypothesis: Hypothesis, k: int, amplitude: float) -> float:
@@ -92,6 +120,7 @@ class Dictionary:
         own: (K,) whether a nuisance column is a parameter of the model itself.
         laws: L laws and profiles.
         law_columns: per law (E, q) change of the whitened errors per unit of each function of its basis.
+        parameters: (K,) name of each nuisance column, and its prior standard deviation [SI].
     """
 
     versions: tuple[Version, ...]
@@ -100,6 +129,7 @@ class Dictionary:
     own: np.ndarray
     laws: tuple[LawForm, ...] = ()
     law_columns: tuple[np.ndarray, ...] = ()
+    parameters: tuple[tuple[str, float], ...] = ()
 
     def select(self, indices: Sequence[int]) -> "Dictionary":
         """Return a dictionary of some versions."""
@@ -176,4 +206,6 @@ def build_dictionary(
     finite = np.isfinite(table).all(axis=0)
     own = np.arange(len(nudges)) < len(guess.deviation)
     versions, columns = [versions[k] for k in valid], [columns[k] for k in valid]
-    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite])
+    sizes = [p.prior_std for h in whole.hypotheses for p in h.parameters.values()]
+    parameters = tuple(pair for pair, kept in zip(zip(whole.names, sizes, strict=True), finite, strict=True) if kept)
+    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite], parameters)

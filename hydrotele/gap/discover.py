@@ -142,7 +142,7 @@ def _drives_of(model, sp, states, position, velocity, act, supply):
 
 def see(data: Dataset, judged: Judged, track: Track) -> Seen:
     """A run of a guess by what the smoother of its track says."""
-    return see_run(judged.guess.machine(data.machine), data, track, is_smoothed=True)
+    return see_run(judged.guess.machine(data.machine, track.run.name), data, track, is_smoothed=True)
 
 
 def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = False) -> Seen:
@@ -283,7 +283,7 @@ class Lacks:
         if set(names) <= set(there):
             columns = track.columns[:, [there.index(n) for n in names]]
         else:
-            machine = self.judged.guess.machine(self.evidence.data.machine)
+            machine = self.judged.guess.machine(self.evidence.data.machine, track.run.name)
             columns = columns_of(machine, track, names)
         return columns[:, 1] - columns[:, 0] if balance == THROUGH else columns[:, 0]
 
@@ -772,9 +772,10 @@ def open_loop(evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise
 
     A law is to make simulations better, not only predictions from one reading to the next.
     """
-    prepare = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)
 
     def sizes(run: RunData) -> np.ndarray:
+        machine = judged.guess.machine(evidence.data.machine, run.name)
+        prepare = machine_runner(machine, evidence.data, _STEP)
         found = free_run_errors(prepare(run), run, (_AHEAD, _FAR_AHEAD), to_end=False).horizons
         near, far = (found.get(f"{seconds:g}") for seconds in (_AHEAD, _FAR_AHEAD))
         if near is None:

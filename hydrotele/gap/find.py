@@ -26,6 +26,7 @@ from hydrotele.gap.description import describe, effect_title, learned_laws
 from hydrotele.gap.discover import Discovery, Learned, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
+from hydrotele.gap.heldout import HeldOut, compare_heldout
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.laws import learned_of, with_profile
@@ -59,10 +60,17 @@ from hydrotele.gap.result import (
     VerdictExplanation,
 )
 from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
+from hydrotele.gap.run_differences import (
+    NUISANCE,
+    between_run_differences,
+    difference_words,
+    list_quantities,
+    widen_to_new_run,
+)
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.gap.verdict import compare_held_out, count_unexplained
 from hydrotele.gap.verdict import verdict_of as verdict_of_regression
-from hydrotele.logs.dataset import Dataset
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
@@ -163,7 +171,11 @@ def find_gap(
             found = search_model(MachineModel(evidence), candidates, tell, has_laws=not effects)
         else:
             found = search(evidence, candidates, tell)
-        discovery, held_out = Discovery(found.judged, ()), None
+        discovery, held_out, own = Discovery(found.judged, ()), None, HeldOut(found, {}, ())
+        if is_regression:
+            tell("compare the held-out run with the fitted runs", 0.92)
+            own = compare_heldout(evidence, found, candidates)
+            found = own.found
         if is_regression and found.guess.parts:
             tell("compare with the given machine on the held-out run", 0.94)
             held_out = compare_held_out(evidence, found.base, found.judged)
@@ -171,8 +183,9 @@ def find_gap(
                 notes.append(held_out.words)
                 found = found.emptied()
                 keep_best(evidence.set_base(found.base))
-                discovery = Discovery(found.judged, ())
-        elif not is_regression and lacking(found.judged, evidence) > 0.0 and not effects:
+        if is_regression:
+            discovery = Discovery(found.judged, ())
+        elif lacking(found.judged, evidence) > 0.0 and not effects:
             if worse := _worse_held_out(evidence, found.judged, opened, jobs):
                 notes.append(_REJECTED.format(worse))
                 found = found.emptied()
@@ -199,7 +212,7 @@ def find_gap(
                 outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
         nominal, patched, judge = data.machine, outcome.patched, outcome.judge
         before, after = outcome.asked, outcome.after
-        tests, floor = judge.tests(evidence, discovery.judged, patched, after)
+        tests, floor = judge.tests(evidence, discovery.judged, after)
         # Numbers of effects were found before the laws, and so were their intervals.
         told = found.judged if discovery.laws else discovery.judged
         evidence.set_base(told)
@@ -211,6 +224,12 @@ def find_gap(
             discovery = dataclasses.replace(discovery, laws=tuple(law for law in laws if not law.form_of))
             varied = {law.hypothesis.key: law for law in laws if law.form_of}
         spread = np.sqrt(np.diag(covariance))
+        differences = (*between_run_differences(told.guess, covariance, own.spread), *own.differences)
+        method_notes = [difference_words(d) for d in differences]
+        method_notes += [
+            f"{h.name} of {h.location} acts in {', '.join(h.runs)}; the corrected machine does not contain it."
+            for h in told.guess.hypotheses if h.runs and h.name not in NUISANCE
+        ]  # fmt: skip
         shares = judge.shares(discovery, before, after, floor, evidence.map)
         traces = trace_inputs(evidence.data, found.base, discovery.judged)
     finally:
@@ -218,7 +237,7 @@ def find_gap(
     learned = learned_laws(discovery, nominal, shares)
     named = _named(found, discovery.judged.guess, spread, shares, not is_regression)
     left = left_over(before[0], after[0], data.channels, floor)
-    details, method_notes = (), []
+    details = ()
     size = GapSize(rms(before[:1]), rms(after[:1]), floor)
     unbounded = dataclasses.replace(size, noise_floor=None)  # process noise may stand for what is missing
     if is_regression:
@@ -254,8 +273,11 @@ def find_gap(
     if jitter[0] != jitter[1] and data.sensors:
         patched = with_value(patched, f"sensors.{data.sensors}.jitter", jitter[0])
     posterior = None
-    if named or calibration or opened:
-        posterior = _sample_posterior(data, given, opened, (discovery.judged.guess, covariance), judge.levels)
+    if named or calibration or opened or differences:
+        fits = widen_to_new_run(
+            discovery.judged.guess, covariance, data.machine, list_quantities(data.machine, candidates)
+        )
+        posterior = _sample_posterior(data, given, opened, fits, judge.levels)
     return Gap(
         machine=given,
         patched=patched,
@@ -295,6 +317,7 @@ def find_gap(
             traces,
         ),
         posterior=posterior,
+        differences=differences,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 
@@ -327,19 +350,21 @@ class _Judge:
         self.runs = (data.heldout, *data.fit)
 
     def tracks(
-        self, machines: Sequence[Machine], each: Callable, runs: Sequence | None = None
+        self, models: Sequence[Machine | Guess], each: Callable, runs: Sequence | None = None
     ) -> list[tuple[Track, ...]]:
-        """Per machine the tracks of the held-out run and the fit runs, or of some runs."""
+        """Per model the tracks of the held-out run and the fit runs, or of some runs."""
         runs = self.runs if runs is None else runs
-        pairs = [(machine, run) for run in runs for machine in machines]
+        pairs = [(self.machine_in(model, run), run) for run in runs for model in models]
         found = list(each(
             lambda pair: track_run(pair[0], self.data, pair[1], levels=self.levels), pairs,
         ))  # fmt: skip
-        return [tuple(found[k :: len(machines)]) for k in range(len(machines))]
+        return [tuple(found[k :: len(models)]) for k in range(len(models))]
 
-    def tests(
-        self, evidence: Evidence, judged: Judged, machine: Machine, tracks: Sequence[Track]
-    ) -> tuple[dict, float | None]:
+    def machine_in(self, model: Machine | Guess, run: RunData) -> Machine:
+        """Return the machine of a model in a run."""
+        return model if isinstance(model, Machine) else model.machine(self.data.machine, run.name)
+
+    def tests(self, evidence: Evidence, judged: Judged, tracks: Sequence[Track]) -> tuple[dict, float | None]:
         """Tests of what a guess leaves, and the noise floor: what readings of its own leave.
 
         A floor is refused where the perfect machine's own runs cannot be followed: they left the
@@ -349,7 +374,8 @@ class _Judge:
         """
         noisy = dataclasses.replace(self.data, noise=self.levels.noise)
         known = self.ripple or bool(self.levels.colours)
-        perfect = () if known else perfect_tracks(machine, noisy, tracks, evidence.map)
+        machines = [self.machine_in(judged.guess, track.run) for track in tracks]
+        perfect = () if known else perfect_tracks(machines, noisy, tracks, evidence.map)
         floor = 1.0 if known else rms(perfect[:1])
         holds = np.isfinite(floor) and _FLOOR[0] < floor < _FLOOR[1]
         clean = holds and not known
@@ -375,9 +401,8 @@ class _Judge:
 
         def share(index: int) -> float:
             hypothesis = guess.parts[index][0]
-            machine = guess.without(index).machine(self.data.machine)
-            once = {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
-            (without,) = self.tracks([machine], map, self.runs if once else self.runs[:1])
+            once = hypothesis.runs or {"start", "duration"} <= hypothesis.parameters.keys()  # not in every run
+            (without,) = self.tracks([guess.without(index)], map, self.runs if once else self.runs[:1])
             then, now = (rms(t if once else t[:1]) ** 2 for t in (before, after))
             whole, back = then - (floor or 1.0) ** 2, rms(without) ** 2 - now
             return float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
@@ -414,8 +439,8 @@ class _Outcome:
         """What a guess and its laws make of them; `opened` where free runs calibrated `given`."""
         data, judge = evidence.data, _Judge(evidence.data, discovery.judged)
         nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
-        machines = [nominal, *([patched] if patched is not nominal else [])]
-        before, *others = judge.tracks(machines + ([given] if opened else []), evidence.map)
+        models = [nominal, *([discovery.judged.guess] if discovery.judged.guess.parts else [])]
+        before, *others = judge.tracks(models + ([given] if opened else []), evidence.map)
         asked = others.pop() if opened else before
         after = others[0] if others else before
         worse = _worse(data, patched, before, after, opened, jobs)
@@ -438,7 +463,7 @@ def _worse_held_out(evidence: Evidence, judged: Judged, opened: FreeCalibration 
         return ""
     data, patched = evidence.data, judged.guess.machine(evidence.data.machine)
     judge = _Judge(data, judged)
-    before, after = judge.tracks([data.machine, patched], evidence.map, (data.heldout,))
+    before, after = judge.tracks([data.machine, judged.guess], evidence.map, (data.heldout,))
     return _worse(data, patched, before, after, opened, jobs)
 
 
@@ -499,16 +524,21 @@ def _named(
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
         rest = found.without[index]
-        if hypothesis.name == CALIBRATION or hypothesis.name.startswith(LEARNED) or rest is None:
+        if hypothesis.name in NUISANCE or hypothesis.name.startswith(LEARNED) or rest is None:
             continue
         chance, others = _chances(found, index, rest)
         trust = _trust(found, rest) if has_trust else 1.0
         chance *= trust
+        fitted = {track.run.name for track in found.judged.tracks}
+        estimates = {
+            key: estimate for key, estimate in _estimates(hypothesis, deviation, own).items()
+            if hypothesis.run_of(key) in fitted | {""}
+        }  # fmt: skip
         others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
         effects.append(
             NamedEffect(
                 hypothesis.name, hypothesis.location, chance,
-                _estimates(hypothesis, deviation, own), others, shares[hypothesis.key],
+                estimates, others, shares[hypothesis.key],
             )
         )  # fmt: skip
     return tuple(sorted(effects, key=lambda effect: -effect.probability))
@@ -704,7 +734,11 @@ def _all_calibrated(
 
 
 def _sample_posterior(
-    data: Dataset, given: Machine, opened: FreeCalibration | None, fit: tuple[Guess, np.ndarray], levels: Levels
+    data: Dataset,
+    given: Machine,
+    opened: FreeCalibration | None,
+    found: Sequence[tuple[Guess, np.ndarray]],
+    levels: Levels,
 ) -> Posterior | None:
     """Draw samples of all parameters that the search, and a calibration before it (`opened`), changed."""
     noise = {channel: float(s) for channel, s in zip(data.channels, levels.whole_noise, strict=True)}
@@ -713,7 +747,7 @@ def _sample_posterior(
     jitter = _jitter(data, levels)
     if jitter[0] != jitter[1] and data.sensors:
         machine = with_value(machine, f"sensors.{data.sensors}.jitter", jitter[0])
-    fits = [(opened.guess, opened.covariance), fit] if opened else [fit]
+    fits = [(opened.guess, opened.covariance), *found] if opened else found
     return sample_posterior(machine, fits, noise)
 
 

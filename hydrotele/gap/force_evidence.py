@@ -29,9 +29,10 @@ from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.residual_force import whiten_forces
 from hydrotele.estimate.track import Levels
 from hydrotele.gap.dictionary import Version
+from hydrotele.gap.gap_model import GapModel, Linearisation
+from hydrotele.gap.laws import LawForm
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
-from hydrotele.gap.profiles import hat_weights
-from hydrotele.gap.regression import NormalEquations, compare_groups
+from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 from hydrotele.identify.linear_least_squares import fit_autoregression
 
@@ -47,7 +48,6 @@ _STEPS = 6  # Gauss-Newton steps
 _SETTLED = 1.0  # twice the log likelihood; a smaller change ends the alternation of fits and noise levels
 _KNOTS = {1: 12, 2: 7}  # hat functions of a law along each of its one or two variables
 _QUANTILES = (0.005, 0.995)  # of a variable, between which the knots lie
-_OWN_SCALE = 10.0  # prior standard deviations within which the parameters of the model may move along
 
 
 class NoiseShape(NamedTuple):
@@ -135,7 +135,8 @@ def _hats(series: Sequence[np.ndarray]) -> np.ndarray:
     """Hat functions (n, l) of one or two variables (n,), or their products."""
     weights = np.ones((len(series[0]), 1))
     for values in series:
-        points = np.linspace(*np.quantile(values, _QUANTILES), _KNOTS[len(series)])
+        low, high = np.quantile(values, _QUANTILES)
+        points = np.linspace(low, high, _KNOTS[len(series)])
         weights = (weights[:, :, None] * hat_weights(values, points)[:, None, :]).reshape(len(values), -1)
     return weights
 
@@ -204,7 +205,7 @@ class ForceTrack:
     gains: Gains
 
 
-class ForceEvidence:
+class ForceEvidence(GapModel):
     """Force equations of some runs, see `gap.gap_model.GapModel`."""
 
     def __init__(
@@ -221,6 +222,7 @@ class ForceEvidence:
                 marginalised for every guess.
         """
         self.columns, self.shape, order = columns, shape, len(shape.follow)
+        self.run_names = ()
         self.keep: Callable[[Judged], None] = lambda judged: None
         self.max_effects = max(_MIN_EFFECTS, _EFFECTS_PER_DRIVE * columns.gap.shape[1])
         self._uncertain = uncertain or Hypothesis(CALIBRATION, "all", {})
@@ -473,13 +475,13 @@ class ForceEvidence:
         nuisance = self._columns(np.concatenate([own, form], axis=2))
         left = self._columns((self._values @ self._along(judged.guess))[:, :, None])[:, 0]
         terms = NormalEquations.of(left, groups, nuisance)
-        scales = np.repeat([_OWN_SCALE, 1.0], [own.shape[2], form.shape[2]])
+        scales = np.repeat([OWN_SCALE, 1.0], [own.shape[2], form.shape[2]])
         marginal = terms.marginalise(scales)
         return compare_groups(terms.edges, marginal.right, marginal.blocks)
 
 
 @dataclass(frozen=True)
-class ForceLinearisation:
+class ForceLinearisation(Linearisation):
     """Combinations of the columns of a `ForceEvidence`, see `gap.gap_model.Linearisation`."""
 
     evidence: ForceEvidence
@@ -489,8 +491,10 @@ class ForceLinearisation:
     nuisance: np.ndarray
     own: np.ndarray
     fraction: float = 1.0
+    laws: Sequence[LawForm] = ()
+    parameters: Sequence[tuple[str, float]] = ()
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[NormalEquations, float]:
+    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return the normal equations from the sums of squares at scaled residual forces."""
         levels = self.evidence._levels
         root, wide = self.evidence._root_of(replace(levels, sizes=residual_scale * levels.sizes))
@@ -498,7 +502,7 @@ class ForceLinearisation:
         if joined:
             groups = [np.hstack([groups[g] for g in joined])]
         errors = root @ self.along
-        return NormalEquations.of(-errors, groups, root @ self.nuisance), float(errors @ errors) + wide
+        return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
 
 
 def calibration_of(parameters: dict) -> MechanismEffect:

@@ -56,7 +56,7 @@ class Linearisation(Protocol):
 
     def with_laws(self, laws: Sequence[LawForm]) -> "Linearisation":
         """Return the linearisation of laws instead of versions."""
-        ...
+        return self
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return per run the normal equations with scaled residual inputs, and -2 log likelihood of all errors.

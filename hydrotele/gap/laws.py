@@ -27,6 +27,7 @@ from hydrotele.estimate.track import STEP, Track, error_responses, steps_per_row
 from hydrotele.gap.description import variable_unit
 from hydrotele.gap.discover import Learned, Seen, see_run
 from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Table
+from hydrotele.gap.regression import compare_groups
 from hydrotele.gap.result import VARIES, Estimate, NamedEffect, Profile
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
@@ -179,7 +180,10 @@ class LawForm:
         """Return what a unit of the balance, held over a row, changes in the states after it (n, nz)."""
         step = _TYPICAL * float(input_sizes(machine, [Input(self.sides[0][0], self.axis)])[0])
         added = [
-            Term(name="unit", axis=self.axis, balance=side, law="constant", parameters={"value": sign * step})
+            Term.model_validate({
+                "name": "unit", "axis": self.axis, "balance": side, "law": "constant",
+                "parameters": {"value": sign * step},
+            })
             for side, sign in self.sides
         ]  # fmt: skip
         ends = []

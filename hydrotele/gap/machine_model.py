@@ -38,7 +38,7 @@ class MachineModel(GapModel):
     def __init__(self, evidence: Evidence) -> None:
         """Take the evidence, with noise levels that it estimates."""
         self.evidence = evidence
-        self.run_names = tuple(run.name for run in (*evidence.data.fit, evidence.data.heldout))
+        self.run_names = tuple(run.name for run in (*evidence.runs, evidence.data.heldout))
         self.keep: Callable[[Judged], None] = lambda judged: evidence.keep(judged)
 
     def prepare(self, candidates: Sequence[Hypothesis], given: Judged) -> list[Hypothesis]:
@@ -77,7 +77,8 @@ class MachineModel(GapModel):
         try:
             kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE) if dense else None
             fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
-            if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in fit.guess.parts[len(now.guess.parts) :]):
+            added = fit.guess.parts[len(now.guess.parts) :]
+            if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in added):
                 return None
             evidence.set_base(now)
             if residual_scale == 1.0:
@@ -97,7 +98,9 @@ class MachineModel(GapModel):
         return FilterLinearisation(self.evidence, machine, tracks, table, sum(len(t.whitened) for t in tracks) / rows)
 
     def list_quantities(self, candidates: Sequence[Hypothesis]) -> Mapping[str, Quantity]:
-        """Return uncertain parameters, and those of effects with one."""
+        """Return uncertain parameters, and those of effects with one; none of a single run."""
+        if len(self.evidence.runs) < 2:
+            return {}
         return list_quantities(self.evidence.data.machine, candidates)
 
     def compare_disturbances(

@@ -668,9 +668,7 @@ class _Builder:
         scale = min(TYPICAL / share, 1.0)
         least = min(LEAST / share, _NOTABLE)
         ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
-        return MechanismEffect(
-            "inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper
-        )
+        return MechanismEffect("inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper)
 
     def sensors(self):
         """Defects of sensors, and the base."""

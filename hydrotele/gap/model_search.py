@@ -32,7 +32,14 @@ from hydrotele.gap.regression import (
 )
 from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Rival, moved_last
-from hydrotele.gap.run_differences import NUISANCE, Quantity, between_runs, compare_between_runs, effect_of, find_columns
+from hydrotele.gap.run_differences import (
+    NUISANCE,
+    Quantity,
+    between_runs,
+    compare_between_runs,
+    effect_of,
+    find_columns,
+)
 from hydrotele.gap.screening import Screened
 from hydrotele.gap.search import Found
 
@@ -286,7 +293,7 @@ def propose(
     table = model.linearise(now.guess, versions, model.uncertain_parameters(now.guess))
     best: dict[tuple[str, str], Proposal] = {}
     varying: dict[tuple[str, str], Proposal] = {}
-    columns = find_columns(table, quantities or {}) if len(model.run_names) > 2 else []
+    columns = find_columns(table.parameters, table.versions, quantities or {})
     chosen: dict[tuple[str, str], int] = {}
     gains: dict[float, float] = {}
     has_calibration = (CALIBRATION, "all") in taken

@@ -12,6 +12,7 @@ The same errors and columns under other noise levels follow from the linearised 
 (`reweight_columns`).
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -113,6 +114,39 @@ class NormalEquations:
         return Marginal(loss, self.right - cross.T @ taken, blocks)
 
 
+def sum_equations(terms: Sequence[NormalEquations]) -> NormalEquations:
+    """Add the products of several runs."""
+    total = terms[0]
+    for other in terms[1:]:
+        total = total + other
+    return total
+
+
+def split_columns(by_run: Sequence[NormalEquations], single: Sequence[int], nuisance: Sequence[int]) -> NormalEquations:
+    """Give single columns a coefficient of their own in every run.
+
+    Args:
+        by_run: the products of R runs with the same columns.
+        single: indices of groups with one column each.
+        nuisance: indices of nuisance columns, which stay nuisance as well.
+
+    Returns:
+        The products of all runs together; the groups are those of `single`, then of `nuisance`, each with R columns.
+    """
+    total = sum_equations(by_run)
+    right = [[t.right[t.edges[g]] for t in by_run] for g in single]
+    right += [[t.nuisance_right[k] for t in by_run] for k in nuisance]
+    blocks = [np.diag([t.blocks[g][0, 0] for t in by_run]) for g in single]
+    blocks += [np.diag([t.nuisance[k, k] for t in by_run]) for k in nuisance]
+    cross = [np.column_stack([t.cross[:, t.edges[g]] for t in by_run]) for g in single]
+    cross += [np.column_stack([t.nuisance[:, k] for t in by_run]) for k in nuisance]
+    edges = len(by_run) * np.arange(len(blocks) + 1)
+    return dataclasses.replace(
+        total, edges=edges, right=np.ravel(right), blocks=tuple(blocks),
+        cross=np.hstack(cross) if cross else total.cross[:, :0],
+    )  # fmt: skip
+
+
 def compare_groups(
     edges: np.ndarray, right: np.ndarray, blocks: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -176,6 +210,16 @@ def sum_of_single_effects(
         if np.abs(means - before).max() < _CONVERGED:
             break
     return chances, means
+
+
+def hat_weights(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the weights (n, k) of hat functions at increasing points; each row adds up to 1.
+
+    >>> hat_weights(np.array([0.25, 2.0]), np.array([0.0, 1.0]))
+    array([[0.75, 0.25],
+           [0.  , 1.  ]])
+    """
+    return np.stack([np.interp(values, points, row) for row in np.eye(len(points))], axis=1)
 
 
 @compiled

@@ -93,7 +93,8 @@ def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
 
 def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
-    w, window = settled(whitened, period), max(2, round(_WINDOW / period))
+    w = settled(whitened, period)
+    window = min(max(2, round(_WINDOW / period)), len(w))  # a shorter run is one window
     there = np.isfinite(w)
     count = there.sum(axis=0).astype(float)
     w = np.where(there, w, 0.0)
@@ -164,10 +165,10 @@ def _spread(evidence: Evidence, guess: Guess) -> tuple[float, str]:
 
 
 def _calibrated(guess: Guess) -> set[int]:
-    """Places of numbers that belong to a calibration or a learned law: they may take up what runs differ by."""
+    """Places of numbers of a calibration, a learned law, or some runs only: they may take up what runs differ by."""
     found, first = set(), 0
     for hypothesis, deviation in guess.parts:
-        if hypothesis.name == CALIBRATION or hypothesis.name.startswith(LEARNED):
+        if hypothesis.name == CALIBRATION or hypothesis.name.startswith(LEARNED) or hypothesis.runs:
             found |= set(range(first, first + len(deviation)))
         first += len(deviation)
     return found
@@ -226,11 +227,13 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
     return replace(run, reading=reading)
 
 
-def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track], each: Callable = map) -> tuple[Track, ...]:
+def perfect_tracks(
+    machines: Sequence[Machine], data: Dataset, tracks: Sequence[Track], each: Callable = map
+) -> tuple[Track, ...]:
     """Tracks of a model on readings that it made itself.
 
     Args:
-        machine: the model.
+        machines: the model in each run.
         data: the dataset.
         tracks: the model's tracks of the runs to take after.
         each: `map`, or that of a pool.
@@ -240,8 +243,8 @@ def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track], eac
     """
 
     def one(k: int) -> Track:
-        run = clean_run(machine, data, tracks[k].run, tracks[k].states[0], _SEED + k)
-        return track_run(machine, data, run)
+        run = clean_run(machines[k], data, tracks[k].run, tracks[k].states[0], _SEED + k)
+        return track_run(machines[k], data, run)
 
     return tuple(each(one, range(len(tracks))))
 

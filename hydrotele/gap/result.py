@@ -289,6 +289,27 @@ class InitialRegressions:
 
 
 @dataclass(frozen=True)
+class RunDifference:
+    """A parameter that differs between runs, or a difference of one run from all others.
+
+    Attributes:
+        name: of the parameter, such as `viscous_friction.boom.viscous`, or of a disturbance and its drive.
+        unit: SI.
+        deviation: standard deviation between runs [unit]; NaN of a difference of one run.
+        runs: run -> its difference from the common value and the standard deviation of that [unit].
+        reach: half-width of the 95 % interval of the difference of a new run [unit]; NaN of one run's.
+        details: other parameters of a disturbance, such as its start, in words.
+    """
+
+    name: str
+    unit: str
+    deviation: float
+    runs: Mapping[str, tuple[float, float]]
+    reach: float = math.nan
+    details: str = ""
+
+
+@dataclass(frozen=True)
 class Contender:
     """A candidate in the place of a named effect.
 
@@ -426,6 +447,7 @@ class Gap(Generic[Model]):
         initial: regressions on measured quantities before the search; None where none were made.
         explanation: candidates, rejections and residual inputs; None where no search gives them.
         posterior: samples of the parameters of effects and of calibrated parameters; None without any.
+        differences: parameters that differ between runs, and what the held-out run alone has.
     """
 
     machine: Model
@@ -454,6 +476,7 @@ class Gap(Generic[Model]):
     initial: InitialRegressions | None = None
     explanation: VerdictExplanation | None = None
     posterior: Posterior | None = None
+    differences: tuple[RunDifference, ...] = ()
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -491,6 +514,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         Of a machine also `answers`: per effect `sure` (the deepest of place, family and law that is
         sure), and the probabilities of `places`, `families` there, `laws`, and `none`.
         `initial_regressions`: regressions on measured quantities before the search, `regressions_document`.
+        `run_differences`: parameters that differ between runs, fields of `RunDifference`.
         `explanation`: why the verdict, `explanation_document`.
     """
     unknown = gap.unknown and {
@@ -506,7 +530,8 @@ def gap_document(gap: Gap) -> dict[str, Any]:
     answers = {} if gap.answers is None else {"answers": gap.answers}
     initial = {} if gap.initial is None else {"initial_regressions": regressions_document(gap.initial)}
     why = {} if gap.explanation is None else {"explanation": explanation_document(gap.explanation)}
-    return finite(open_loop | answers | initial | why | {
+    differing = {"run_differences": [dataclasses.asdict(d) for d in gap.differences]} if gap.differences else {}
+    return finite(open_loop | answers | initial | why | differing | {
         "verdict": gap.verdict,
         "effects": [effect_document(effect) for effect in gap.effects],
         "calibration": {

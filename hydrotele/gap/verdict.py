@@ -15,6 +15,7 @@ import numpy as np
 from hydrotele.estimate.evidence import Evidence, Judged
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.gap.description import gap_closed
+from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, settle_noise
 from hydrotele.gap.result import LIKELY, SURE, GapSize, LearnedLaw, NamedEffect, Verdict
 
@@ -72,13 +73,13 @@ def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOu
     def loss(judged: Judged) -> float:
         own = Evidence(evidence.data, (run,), 1, evidence.step, lacking=True)
         try:
-            return settle_noise(own, own.judged(judged.guess)).loss - judged.guess.prior
+            return settle_noise(MachineModel(own), own.judged(judged.guess)).loss - judged.guess.prior
         finally:
             own.close()
 
     def errors(judged: Judged) -> np.ndarray:
         """Return the log errors of open-loop windows in units of the noise of the given model; at least 0."""
-        runner = machine_runner(judged.guess.machine(evidence.data.machine), evidence.data, _STEP)(run)
+        runner = machine_runner(judged.guess.machine(evidence.data.machine, run.name), evidence.data, _STEP)(run)
         found = free_run_errors(runner, run, (_AHEAD,), to_end=False).horizons.get(f"{_AHEAD:g}")
         if found is None:
             return np.zeros(0)

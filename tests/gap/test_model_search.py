@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from hydrotele.effects import EFFECTS, Effect, Parameter
+from hydrotele.effects.effect import all_axes
 from hydrotele.estimate.colour import Colour
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
@@ -17,6 +19,7 @@ from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.terms.term import Term
 from tests.measured import MEASURED
 from tests.small_machines import add_coloured_noise, simulate_data
 
@@ -48,6 +51,34 @@ def test_the_answer_adds_up_and_names_the_deepest_sure_level():
     assert answer.families("boom") == {"friction": pytest.approx(0.98), "leakage": pytest.approx(0.01)}
     assert answer.level == ("boom", "friction")
     assert sum(answer.places().values()) + answer.none == pytest.approx(1.0)
+
+
+def _set_ripple(machine, location, values):
+    formula = {f"cos(position, {values['length']!r})": values["force"]}
+    term = Term(name="ripple", axis=location, balance="force", law="formula", parameters=formula)
+    return machine.model_copy(update={"terms": (*machine.terms, term)}) if values["force"] else machine
+
+
+def test_a_custom_effect_is_found_whatever_its_start_value(monkeypatch):
+    """The force is periodic in the position; its likelihood has a maximum at many lengths of the period."""
+
+    def parameters(machine, location):
+        return {
+            "force": Parameter("N", 0.0, -500.0, 500.0, 50.0, 1.0, (20.0,)),
+            "length": Parameter("m", 0.45, 0.02, 0.5, 0.1, 1e-3, (0.45,)),
+        }
+
+    effect = Effect("ripple", "a force that is periodic in the position", "force", all_axes, parameters, _set_ripple)
+    monkeypatch.setitem(EFFECTS, "ripple", effect)
+    rig = load_machine("rig")
+    channels = ("position.slide", "pressure_head.slide", "pressure_rod.slide")
+    truth = _set_ripple(rig, "slide", {"force": 150.0, "length": 0.1})
+    noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
+    data = simulate_data(truth, channels, noise, model=rig, period=0.005, rows=1000, noise_stated=True)
+    gap = find_gap(data, effects=("ripple", "coulomb_friction"), jobs=1, method="regression")
+    (found,) = gap.effects
+    assert found.name == "ripple"
+    assert found.parameters["length"].low < 0.1 < found.parameters["length"].high
 
 
 @pytest.fixture(scope="module")

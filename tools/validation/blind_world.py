@@ -9,7 +9,8 @@
 Kinds: `near` (a mechanism of the library in another form), `noise` (0.7 to 2 times the stated one,
 every second with an effect), `off` (every number of the model wrong, every second with an effect),
 `outside` (random laws), `clean`, `library` (one or two effects, sizes from the field), `coloured`
-(half to all of the sensors' noise is correlated in time, every second with an effect).
+(half to all of the sensors' noise is correlated in time, every second with an effect), `drift` (the
+oil has another viscosity in every run, every second with an effect).
 A process of its own makes each trial and seals its key; another one gets a copy of the logs and the
 nominal machine. Each answer is stamped with the commit of the search; `summary.md` and
 `summary.json` appear in the folder. Needs the project's own environment (`bash tools/setup`).

@@ -198,7 +198,7 @@ def score_world(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """Rates with Wilson's intervals, closures, times and memory, by kind.
 
     Args:
-        outcomes: of the finished trials; `noise`, `off` and `coloured` are split by whether something was
+        outcomes: of the finished trials; `noise`, `off`, `coloured` and `drift` are split by whether something was
             planted.
 
     Returns:
@@ -206,7 +206,7 @@ def score_world(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     """
     groups: dict[str, list[Outcome]] = {}
     for o in outcomes:
-        planted = "" if o.kind not in ("noise", "off", "coloured") else ", planted" if o.planted else ", bare"
+        planted = "" if o.kind not in ("noise", "off", "coloured", "drift") else ", planted" if o.planted else ", bare"
         groups.setdefault(o.kind + planted, []).append(o)
     rows = {name: _row(chosen) for name, chosen in sorted(groups.items())}
     return {"rows": rows, "targets": _targets(rows, groups)}
@@ -245,7 +245,7 @@ def _median_and_most(values: Sequence[float | None]) -> tuple[float, float] | No
 
 def _targets(rows: dict[str, Any], groups: dict[str, list[Outcome]]) -> dict[str, Any]:
     """What is asked of the search, pooled over kinds where that is asked."""
-    kinds = ("noise", "off", "coloured")
+    kinds = ("noise", "off", "coloured", "drift")
     bare = [o for name in kinds for o in groups.get(f"{name}, bare", [])]
     planted = [o for name in kinds for o in groups.get(f"{name}, planted", [])]
     covered = [flag for o in (*bare, *planted) for flag in o.covered]

@@ -16,6 +16,7 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
+from hydrotele.effects.effect import with_value
 from hydrotele.effects.mass import PAYLOAD
 from hydrotele.estimate.hypothesis import numbers as uncertain_numbers
 from hydrotele.machine.machine import Machine as Facts
@@ -36,11 +37,12 @@ from tools.validation.blind.world_runs import (
     visibility,
 )
 
-KINDS = ("near", "noise", "off", "outside", "clean", "library", "coloured")
+KINDS = ("near", "noise", "off", "outside", "clean", "library", "coloured", "drift")
 _ATTEMPTS = 20
 _SENSOR_KINDS = ("angle", "position", "length", "pressure")
 _PLANTED_SHARE = 0.5  # of the trials with wrong noise or wrong numbers that hide an effect, too
 _DOUBLE_SHARE = 0.3  # of the library's trials
+_DRIFT_STD = 0.3  # of the logarithm of the oil's viscosity between days: some 10 K of oil temperature
 _APART = 3.0  # standard deviations of an uncertain number beyond which it is an effect
 _SEEN = 10.0  # least visibility of a planted effect; a weaker draw is replaced
 
@@ -92,6 +94,19 @@ class Drawn:
     noise: Noise
     numbers: dict[str, tuple[float, float]]
 
+    def on_another_day(self, rng: np.random.Generator) -> tuple[Machine, float]:
+        """Return the machine with oil of another viscosity, and the ratio of the viscosities.
+
+        Viscous friction of all drives is proportional to it, leakage past all pistons inversely.
+        """
+        ratio, facts = float(np.exp(_DRIFT_STD * rng.standard_normal())), self.facts
+        for name, axis in facts.axes.items():
+            kind = "cylinder" if axis.cylinder else "motor"
+            path, drive = f"axes.{name}.{kind}", axis.hydraulic_drive
+            facts = with_value(facts, f"{path}.friction.viscous", ratio * drive.friction.viscous)
+            facts = with_value(facts, f"{path}.leakage", drive.leakage / ratio)
+        return nominal_world(facts), ratio
+
 
 def draw_trial(model: Facts, kind: str, turn: int, rng: np.random.Generator) -> Drawn:
     """Draw the true machine of a trial.
@@ -119,7 +134,7 @@ def draw_trial(model: Facts, kind: str, turn: int, rng: np.random.Generator) -> 
         return _draw_form(model, turn, rng, noise)
     planted: list[dict[str, Any]] = []
     count = {"library": 2 if turn % 10 < 10 * _DOUBLE_SHARE else 1}.get(kind, 0)
-    if kind in ("noise", "off", "coloured") and turn % 2 < 2 * _PLANTED_SHARE:
+    if kind in ("noise", "off", "coloured", "drift") and turn % 2 < 2 * _PLANTED_SHARE:
         count = 1
     bare, alone = facts, []
     for _ in range(count):
@@ -187,7 +202,7 @@ def make_trial(place: Place, series: WorldSeries) -> None:
     planted = [{**p, "visibility": v} for p, v in zip(drawn.planted, seen, strict=True)]
     write_json(place.key, {
         "trial": place.trial, "kind": kind, "planted": planted, "numbers": drawn.numbers,
-        "truth": true_parameters(model, drawn.facts) if kind not in ("near", "outside") else {},
+        "truth": true_parameters(model, drawn.facts) if kind not in ("near", "outside", "drift") else {},
         "noise": dataclasses.asdict(drawn.noise), "redrawn": redrawn,
         "nonce": rng.bytes(16).hex(),
     })  # fmt: skip
@@ -211,11 +226,17 @@ def _attempt(
         told["right"] = []
         drawn = dataclasses.replace(drawn, world=world, planted=[told], without=[plain])
     runs = [record_run(drawn.world, model, one, drawn.noise, rng) for one in asked]
+    shown = runs
+    if kind == "drift":
+        days = [drawn.on_another_day(rng) for _ in asked]
+        shown = [record_run(w, model, one, drawn.noise, rng) for (w, _), one in zip(days, asked, strict=True)]
+        ratios = {f"viscosity in {run.name}": (1.0, ratio) for run, (_, ratio) in zip(shown, days, strict=True)}
+        drawn = dataclasses.replace(drawn, numbers=ratios)
     seen = [visibility(without, model, runs) for without in drawn.without]
     if any(size < _SEEN for size in seen):
         names = ", ".join(p["name"] for p in drawn.planted)
         raise InputError("trial", f"{names} shows no more than {min(seen):.3g}")
-    return drawn, runs, [float(f"{size:.4g}") for size in seen]
+    return drawn, shown, [float(f"{size:.4g}") for size in seen]
 
 
 def refuse_uncertain(model: Facts, drawn: Drawn) -> None:
