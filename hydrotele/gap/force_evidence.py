@@ -14,7 +14,7 @@ Drives are decorrelated by the inverse root of the noise's covariance (Kessy, Le
 Statistician 72(4)), so that channel k remains closest to drive k.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -29,7 +29,7 @@ from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.residual_force import whiten_forces
 from hydrotele.estimate.track import Levels
 from hydrotele.gap.dictionary import Version
-from hydrotele.gap.gap_model import GapModel, Linearisation
+from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
@@ -481,7 +481,7 @@ class ForceEvidence(GapModel):
 
 
 @dataclass(frozen=True)
-class ForceLinearisation(Linearisation):
+class ForceLinearisation:
     """Combinations of the columns of a `ForceEvidence`, see `gap.gap_model.Linearisation`."""
 
     evidence: ForceEvidence
@@ -493,6 +493,18 @@ class ForceLinearisation(Linearisation):
     fraction: float = 1.0
     laws: Sequence[LawForm] = ()
     parameters: Sequence[tuple[str, float]] = ()
+
+    def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
+        """Return no laws: `ForceEvidence.compare_laws` compares them after the effects."""
+        return []
+
+    def list_pairs(self, single: LawForm) -> list[LawForm]:
+        """Return no laws."""
+        return []
+
+    def with_laws(self, laws: Sequence[LawForm]) -> "ForceLinearisation":
+        """Return the same."""
+        return self
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return the normal equations from the sums of squares at scaled residual forces."""

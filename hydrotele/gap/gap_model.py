@@ -48,15 +48,15 @@ class Linearisation(Protocol):
 
     def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
         """Return profiles of effects, and laws over one variable, that may explain the residual inputs of a model."""
-        return []
+        ...
 
     def list_pairs(self, single: LawForm) -> list[LawForm]:
         """Return the laws over products of the variable of a law with another one."""
-        return []
+        ...
 
     def with_laws(self, laws: Sequence[LawForm]) -> "Linearisation":
         """Return the linearisation of laws instead of versions."""
-        return self
+        ...
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return per run the normal equations with scaled residual inputs, and -2 log likelihood of all errors.

@@ -17,7 +17,7 @@ from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
 from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
-from hydrotele.gap.gap_model import GapModel, Linearisation
+from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
@@ -189,7 +189,7 @@ def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True)
-class FilterLinearisation(Linearisation):
+class FilterLinearisation:
     """Columns of the linearised filter, see `gap.gap_model.Linearisation`."""
 
     evidence: Evidence
