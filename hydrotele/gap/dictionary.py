@@ -208,4 +208,4 @@ def build_dictionary(
     versions, columns = [versions[k] for k in valid], [columns[k] for k in valid]
     sizes = [p.prior_std for h in whole.hypotheses for p in h.parameters.values()]
     parameters = tuple(pair for pair, kept in zip(zip(whole.names, sizes, strict=True), finite, strict=True) if kept)
-    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite], parameters)
+    return Dictionary(tuple(versions), tuple(columns), table[:, finite], own[finite], parameters=parameters)
