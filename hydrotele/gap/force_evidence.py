@@ -120,15 +120,19 @@ def estimate_noise(columns: Columns) -> NoiseShape:
 
 
 def _free_laws(columns: Columns) -> np.ndarray:
-    """(n, k, l) forces of a typical size that are any function of the position or the rate of their own drive."""
+    """(n, k, l) forces of a typical size: constants of each run, functions of position and rate of their own drive."""
     size, out = TYPICAL * np.sqrt(np.mean(columns.measured**2, axis=0)), []
+    runs = np.repeat(np.eye(len(columns.runs)), np.diff(columns.starts), axis=0)
     for k, drive in enumerate(columns.drives):
+        constants = np.zeros((*columns.gap.shape, len(columns.runs)))
+        constants[:, k] = size[k] * runs
+        out.append(constants)
         for name in (f"position.{drive}", f"velocity.{drive}"):
             if name in columns.states:
                 made = np.zeros((*columns.gap.shape, _KNOTS[1]))
                 made[:, k] = size[k] * _hats([columns.states[name]])
                 out.append(made)
-    return np.concatenate(out, axis=2) if out else np.zeros((*columns.gap.shape, 0))
+    return np.concatenate(out, axis=2)
 
 
 def _hats(series: Sequence[np.ndarray]) -> np.ndarray:

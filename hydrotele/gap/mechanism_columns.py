@@ -448,6 +448,7 @@ _FORM = 0.2  # of a drive's dry friction, which its form near rest may change
 _NONE = 1e-9  # share that has no effect
 _ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
 _NOTABLE = 0.2  # of a body's moments of inertia that is worth naming, little as forces may change
+_LATE_STEP = 0.02  # s, typical delay of a sensor, and its largest change from round to round
 _SECOND = 0.1  # s, beyond which no sensor is late
 
 Key = tuple[str, str]
@@ -689,7 +690,11 @@ class _Builder:
         facts = self.number(column, "s")
         if facts is None:
             return None
-        facts = Parameter("s", 0.0, low, _SECOND, min(facts.prior_std, 0.02), facts.min_relevant_change)
+        known = float(self.applied.get((name, place), [0.0])[0])
+        reach = min(facts.prior_std, _LATE_STEP)  # its column is a small difference: it holds near the known delay
+        facts = Parameter(
+            "s", 0.0, max(low, known - reach), min(_SECOND, known + reach), reach, facts.min_relevant_change
+        )
         return MechanismEffect(name, place, {"delay": facts}, None, (column,))
 
     def scale(self, drive: str) -> MechanismEffect | None:

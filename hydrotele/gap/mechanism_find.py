@@ -49,6 +49,7 @@ from hydrotele.gap.patched import (
 )
 from hydrotele.gap.residuals import believed_part
 from hydrotele.gap.result import (
+    LIKELY,
     Alternative,
     Candidate,
     Estimate,
@@ -214,6 +215,8 @@ def find_mechanism_gap(
             result = _evaluate(task, evidence, found.judged, then)
         named = _named(task, evidence, result, chances)
         named, more = without_details(named, bool(result.lacking.any()), task.drives)
+        unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
+        named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
         details += more
         if not more:
             break
@@ -369,7 +372,7 @@ def _is_small(effect: MechanismEffect, values: np.ndarray) -> bool:
 
 def _not_named(key: Key, values: Mapping[str, float]) -> str:
     told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-    return f"{key[0]} at {key[1]} ({told}) is too small to be named; the patched model does not contain it."
+    return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
 
 
 def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
