@@ -179,7 +179,10 @@ class LawForm:
         """Return what a unit of the balance, held over a row, changes in the states after it (n, nz)."""
         step = _TYPICAL * float(input_sizes(machine, [Input(self.sides[0][0], self.axis)])[0])
         added = [
-            Term(name="unit", axis=self.axis, balance=side, law="constant", parameters={"value": sign * step})
+            Term.model_validate({
+                "name": "unit", "axis": self.axis, "balance": side, "law": "constant",
+                "parameters": {"value": sign * step},
+            })
             for side, sign in self.sides
         ]  # fmt: skip
         ends = []
