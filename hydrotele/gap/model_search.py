@@ -25,7 +25,7 @@ from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_vari
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, build_dictionary, list_versions
-from hydrotele.gap.disturbances import acts_for_a_while, compare_disturbances, list_disturbances
+from hydrotele.gap.disturbances import compare_disturbances, is_pulse, list_disturbances
 from hydrotele.gap.regression import (
     NormalEquations,
     compare_groups,
@@ -45,7 +45,7 @@ from hydrotele.gap.run_differences import (
     list_quantities,
     rescale_between_runs,
 )
-from hydrotele.gap.screening import Screened, timed
+from hydrotele.gap.screening import Screened
 from hydrotele.gap.search import Found
 from hydrotele.machine.machine import Machine
 
@@ -170,7 +170,7 @@ def search_model(evidence: Evidence, candidates: Sequence[Hypothesis], progress:
     evidence.keep(given.judged)
     candidates = [c for c in candidates if c.name not in _EXCLUDED]
     quantities = list_quantities(evidence.data.machine, candidates)
-    rounds, first = add_effects(evidence, given, timed(candidates, given.judged), quantities, tell)
+    rounds, first = add_effects(evidence, given, candidates, quantities, tell)
     now = rounds[-1].after if rounds else given
     tell("compare coloured noise", 0.85)
     now = compare_colours(evidence, now)
@@ -215,7 +215,7 @@ def add_effects(
         share = 0.05 + 0.8 * index / _MAX_EFFECTS
         tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals, varying = propose(evidence, now, [c for c in pool if not acts_for_a_while(c)], quantities)
+        proposals, varying = propose(evidence, now, [c for c in pool if not is_pulse(c)], quantities)
         disturbances = propose_disturbances(evidence, now, candidates)
         proposals = sorted([*proposals, *disturbances], key=lambda p: -p.factor)
         first = first or tuple(proposals)
@@ -325,12 +325,12 @@ def propose(
 
 
 def propose_disturbances(evidence: Evidence, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
-    """Rank forces that act for a while or periodically, in one run or in all, on all rows of the runs.
+    """Rank force pulses and periodic forces, in one run or in all, on all rows of the runs.
 
     Args:
         evidence: whose base is the model.
         now: the model.
-        candidates: effects, among them those that act for a while.
+        candidates: effects, among them pulses.
     """
     taken = keys_of(now)
     tried = [h for h in list_disturbances(evidence.data, candidates, now.judged) if h.key not in taken]
