@@ -1,4 +1,4 @@
-"""Forces that act for a while or periodically: where, in which run and when.
+"""Force pulses and periodic forces: where, in which run and when.
 
 A pulse is looked for in every run alone, where its residual force is largest, and in all runs at the same time. A
 periodic force has the period at which the spectrum of the residual force is largest; its phase is another one in every
@@ -25,7 +25,7 @@ from hydrotele.terms.term import Term
 
 PERIODIC_FORCE = "periodic_force"
 """Name of a force that is periodic in time."""
-_PULSE = ("size", "start", "duration")  # parameters of an effect that acts for a while only
+_PULSE = ("size", "start", "duration")  # parameters of an effect of limited duration
 _PERIODIC_STD = 0.03  # of the largest force, as the prior of a pulse
 _WAVES = ("cosine", "sine")  # parameters of a periodic force in one run, which are also functions of a formula
 _INSTANTS = 160  # of a run at which a pulse may start or end; its refinement is continuous
@@ -33,7 +33,7 @@ _MIN_CYCLES = 3.0  # in a run, of a periodic force; a slower one is a law of the
 _MIN_ROWS = 4.0  # of a period: a faster one does not show in rows
 
 
-def acts_for_a_while(hypothesis: Hypothesis) -> bool:
+def is_pulse(hypothesis: Hypothesis) -> bool:
     """Return whether an effect has a size, a start and a duration."""
     return set(_PULSE) <= hypothesis.parameters.keys()
 
@@ -43,11 +43,11 @@ def list_disturbances(data: Dataset, candidates: Sequence[Hypothesis], judged: J
 
     Args:
         data: the logs.
-        candidates: effects; those that act for a while count.
+        candidates: effects; those with a size, a start and a duration count.
         judged: the model, whose residual forces show the periods.
     """
     inputs = judged.tracks[0].levels.inputs
-    pulses = [c for c in candidates if acts_for_a_while(c) and Input("force", c.location) in inputs]
+    pulses = [c for c in candidates if is_pulse(c) and Input("force", c.location) in inputs]
     if not pulses:
         return []
     series = [smoothed_inputs(track) for track in judged.tracks]
@@ -136,7 +136,7 @@ def compare_disturbances(
     Returns:
         Each with the deviation at which it is most likely, and twice its log Bayes factor.
     """
-    return list(each(lambda h: (_locate_pulse if acts_for_a_while(h) else _compare_waves)(h, tracks), tried))
+    return list(each(lambda h: (_locate_pulse if is_pulse(h) else _compare_waves)(h, tracks), tried))
 
 
 def _responses(track: Track, h: Hypothesis, shapes: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.estimate.evidence import Evidence, invert_information
 from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration
-from hydrotele.gap.disturbances import acts_for_a_while
+from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import Model, add_effects, settle, settle_noise
 from hydrotele.gap.result import RunDifference
@@ -66,7 +66,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         held = Model(replace(now.judged, guess=Guess(tuple((h.held(d), np.zeros(0)) for h, d in parts))))
         other.set_base(held.judged)
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
-        pulses = [c for c in candidates if acts_for_a_while(c)]
+        pulses = [c for c in candidates if is_pulse(c)]
         rounds, _ = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
         last = rounds[-1].after if rounds else held
         if not last.fit:  # nothing, or coloured noise
@@ -97,7 +97,7 @@ def _only(h: Hypothesis, deviation: np.ndarray, run: str) -> tuple[Hypothesis, n
 
 
 def _with_run(guess: Guess, fitted: Guess, run: str) -> Guess:
-    """Return a guess with the deviations of a run's parameters taken from another one of the same parts."""
+    """Return a hypothesis with the deviations of a run's parameters taken from another one of the same parts."""
     parts = []
     for (h, deviation), (_, own) in zip(guess.parts, fitted.parts, strict=True):
         moved = deviation.copy()

@@ -21,7 +21,6 @@ from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
-from hydrotele.gap.screening import timed
 from hydrotele.machine.machine import Machine
 
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
@@ -42,8 +41,8 @@ class MachineModel(GapModel):
         self.keep: Callable[[Judged], None] = lambda judged: evidence.keep(judged)
 
     def prepare(self, candidates: Sequence[Hypothesis], given: Judged) -> list[Hypothesis]:
-        """Let effects that act for a while start where the residual force of the given machine is largest."""
-        return timed(candidates, given)
+        """Return the candidates: pulses start where their interval has the largest Bayes factor."""
+        return list(candidates)
 
     def uncertain_parameters(self, guess: Guess, scale: float = 1.0) -> Hypothesis:
         """Return the uncertain parameters of the machine file, without those of the effects that are there."""

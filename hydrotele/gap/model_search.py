@@ -19,7 +19,7 @@ from hydrotele.estimate.evidence import Fit, Judged, occam_penalty
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.dictionary import list_versions
-from hydrotele.gap.disturbances import acts_for_a_while
+from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.gap_model import GapModel, Linearisation
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior
 from hydrotele.gap.regression import (
@@ -210,7 +210,7 @@ def add_effects(
         tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
         proposals, varying = propose(
-            model, now, [c for c in pool if not acts_for_a_while(c)], quantities, effects, has_laws
+            model, now, [c for c in pool if not is_pulse(c)], quantities, effects, has_laws
         )
         proposals = sorted([*proposals, *propose_disturbances(model, now, candidates)], key=lambda p: -p.factor)
         first = first or tuple(proposals)
@@ -360,12 +360,12 @@ def _compare_columns(
 
 
 def propose_disturbances(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> list[Proposal]:
-    """Rank forces that act for a while or periodically, in one run or in all, on all rows of the runs.
+    """Rank force pulses and periodic forces, in one run or in all, on all rows of the runs.
 
     Args:
         model: whose base is `now`.
         now: the model.
-        candidates: effects, among them those that act for a while.
+        candidates: effects, among them pulses.
     """
     found: dict[tuple[str, str], Proposal] = {}
     for part, factor, scale in model.compare_disturbances(now.judged, candidates, RESIDUAL_SCALES):

@@ -123,7 +123,7 @@ def sum_equations(terms: Sequence[NormalEquations]) -> NormalEquations:
 
 
 def split_columns(by_run: Sequence[NormalEquations], single: Sequence[int], nuisance: Sequence[int]) -> NormalEquations:
-    """Give single columns a coefficient of their own in every run.
+    """Give single columns a separate coefficient in every run.
 
     Args:
         by_run: the products of R runs with the same columns.

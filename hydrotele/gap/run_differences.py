@@ -1,4 +1,4 @@
-"""What differs between runs: parameters with a value of their own in every run.
+"""What differs between runs: parameters with another value in every run.
 
 Friction follows the oil temperature, a sensor is zeroed every morning, a bucket is loaded in one run. Every parameter
 with a slope may differ: its value in run r is `mean + u_r`, and `u_r ~ N(0, s^2)`. The standard deviation s between
@@ -216,7 +216,7 @@ def rescale_between_runs(judged: Judged, fit: Fit, runs: Sequence[RunData]) -> t
     for index, (h, _) in enumerate(guess.parts):
         if h.name == BETWEEN_RUNS:
             own = [first + k for k, run in enumerate(h.parameters) if run in names]
-            if len(own) > 1:  # one run says nothing of a scatter
+            if len(own) > 1:  # a scatter needs two runs
                 groups.append((index, own, first, h.size))
         first += h.size
     if not groups:

@@ -10,6 +10,7 @@ from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.law_tables import THROUGH, Table
 from hydrotele.gap.laws import LawForm, list_forms
+from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import search_model
 from hydrotele.gap.result import GapSize, LearnedLaw, NamedEffect
 from hydrotele.gap.verdict import HeldOut, count_unexplained, verdict_of
@@ -89,7 +90,7 @@ def test_a_force_without_a_cause_is_learned_in_competition_with_effects():
     candidates = [h for h in hypotheses(data.machine) if h.name in ("coulomb_friction", "payload", "internal_leakage")]
     evidence = Evidence(data, data.fit, 1, STEP, lacking=True)
     try:
-        found = search_model(evidence, candidates, has_laws=True)
+        found = search_model(MachineModel(evidence), candidates, has_laws=True)
     finally:
         evidence.close()
     assert [h.key for h in found.guess.hypotheses] == [("learned_force", "slide.position")]
