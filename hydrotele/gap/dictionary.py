@@ -6,7 +6,7 @@ averages over them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -93,11 +93,6 @@ class Dictionary:
     columns: tuple[np.ndarray, ...]
     nuisance: np.ndarray
     own: np.ndarray
-
-    def select(self, indices: Sequence[int]) -> "Dictionary":
-        """Return a dictionary of some versions."""
-        versions = tuple(self.versions[i] for i in indices)
-        return replace(self, versions=versions, columns=tuple(self.columns[i] for i in indices))
 
 
 def build_dictionary(
