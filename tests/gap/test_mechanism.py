@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.force_evidence import estimate_noise
+from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.patched import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
