@@ -131,12 +131,6 @@ class Dictionary:
     law_columns: tuple[np.ndarray, ...] = ()
     parameters: tuple[tuple[str, float], ...] = ()
 
-    def select(self, indices: Sequence[int]) -> "Dictionary":
-        """Return a dictionary of some versions."""
-        versions = tuple(self.versions[i] for i in indices)
-        columns = tuple(self.columns[i] for i in indices)
-        return replace(self, versions=versions, columns=columns, laws=(), law_columns=())
-
     def with_laws(self, laws: Sequence[LawForm], machine: Machine, tracks: Sequence[Track], seen: Sequence[Seen],
                   each: Callable) -> "Dictionary":  # fmt: skip
         """Return a dictionary of laws instead of versions.

@@ -6,7 +6,7 @@ The errors are the measured less the modelled drive forces, low-passed. They are
 
 w is the residual force of each drive, an Ornstein-Uhlenbeck process, and v is noise. The noise's shape, an
 autoregression of each drive and the covariance between drives, is estimated once: it is what a model in which
-everything may differ leaves within the correlation time of a residual force. In errors that this shape makes white,
+everything may differ leaves. In errors that this shape makes white,
 each channel is an Ornstein-Uhlenbeck process plus white noise, followed by a Kalman filter with one state. Both levels
 are re-estimated for every guess. For given levels, sums of squares of the whitened columns hold all that a fit needs.
 
@@ -91,7 +91,7 @@ class NoiseShape(NamedTuple):
 def estimate_noise(columns: Columns) -> NoiseShape:
     """Estimate the shape of the noise of some runs from what all columns together leave.
 
-    What the residual keeps longer than a residual force's correlation time is no noise: its running mean is removed.
+    The autoregression spans a third of the correlation time of a residual force; what lasts longer is no noise.
 
     Args:
         columns: of the runs.
@@ -114,8 +114,7 @@ def estimate_noise(columns: Columns) -> NoiseShape:
         factor = cho_factor(square + np.eye(len(square)))
         rest = gap - matrix @ cho_solve(factor, x.T @ y)
         used = float(np.trace(cho_solve(factor, square))) / len(y)
-        rest, kept = _without_slow(rest, columns)
-        shape = _shape_of(rest, columns, max(kept - used, 0.1))
+        shape = _shape_of(rest, columns, max(1.0 - used, 0.1))
     return shape
 
 
@@ -149,17 +148,6 @@ def typical_sizes(columns: Columns) -> np.ndarray:
     """Return the coefficient (m,) of each column that moves a drive by a typical share of its force; 0 without any."""
     share = strengths(columns)
     return np.divide(TYPICAL, share, out=np.zeros(len(share)), where=share > 1e-12)
-
-
-def _without_slow(rest: np.ndarray, columns: Columns) -> tuple[np.ndarray, float]:
-    """Subtract the running mean over the correlation time of residual forces; what remains, and its fraction."""
-    reach = max(1, round(0.5 * MEMORY / columns.spacing))
-    width, out = 2 * reach + 1, rest.copy()
-    for first, last in zip(columns.starts[:-1], columns.starts[1:], strict=True):
-        count = np.convolve(np.ones(last - first), np.ones(width), mode="same")
-        for k in range(rest.shape[1]):
-            out[first:last, k] -= np.convolve(rest[first:last, k], np.ones(width), mode="same") / count
-    return out, 1.0 - 1.0 / width
 
 
 def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
