@@ -67,9 +67,10 @@ gc.set_threshold(100_000, 50, 100)  # a full collection of all that the suite ha
 report_html._DPI = 50  # pictures of reports are drawn in a third of the time
 
 # No deadline: the first example pays for numba's compilation. The same examples each time, so
-# that a red run can be repeated.
-hypothesis.settings.register_profile("hydrotele", deadline=None, derandomize=True)
-hypothesis.settings.load_profile("hydrotele")
+# that a red run can be repeated. tools/nightly draws new ones, twenty times as many.
+hypothesis.settings.register_profile("daily", deadline=None, derandomize=True, max_examples=25)
+hypothesis.settings.register_profile("nightly", deadline=None, max_examples=500)
+hypothesis.settings.load_profile("daily")
 
 
 # Files that take three seconds or more, the longest first: two processes then end together. A file

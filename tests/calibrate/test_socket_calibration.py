@@ -122,6 +122,7 @@ def test_rows_with_the_ball_elsewhere_are_named_and_left_out(noisy):
     assert evaluate_robot(found.robot, unseen).rms < 0.087e-3
 
 
+@pytest.mark.nightly
 @needs_real
 def test_measured_panda_reaches_the_published_accuracy():
     sockets, _ = load_sockets(MEASURED)

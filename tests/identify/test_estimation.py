@@ -41,7 +41,7 @@ def found(repeated):
     return functools.cache(lambda method: identify_dynamics(*repeated, processing, Estimator(method)))
 
 
-@pytest.mark.daily("least_squares", "weighted")
+@pytest.mark.daily("weighted")
 @pytest.mark.parametrize("method", METHODS)
 def test_every_estimator_finds_the_recorded_machine_within_its_ellipsoid(found, method):
     one = found(method)
