@@ -197,7 +197,7 @@ def build_dictionary(
     columns = evidence.map(of_version, versions)
     valid = [k for k, c in enumerate(columns) if np.isfinite(c).all() and np.any(c)]
     table = np.column_stack(nuisance) if nuisance else np.zeros((len(base), 0), np.float32)
-    finite = np.isfinite(table).all(axis=0)
+    finite = np.atleast_1d(np.isfinite(table).all(axis=0))
     own = np.arange(len(nudges)) < len(guess.deviation)
     versions, columns = [versions[k] for k in valid], [columns[k] for k in valid]
     sizes = [p.prior_std for h in whole.hypotheses for p in h.parameters.values()]
