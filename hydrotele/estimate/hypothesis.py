@@ -48,6 +48,8 @@ class Hypothesis:
     common, and what is rare, as an inertia ten times the model's, is no reason to prefer three
     other effects of common size.
 
+    `choice_cost` is -2 log of the prior probability of a choice that was made with the data, such as that of an interval.
+
     With `runs`, it acts in these runs only. A parameter `RUN` or `RUN: NAME` belongs to that run alone.
     """
 
@@ -56,6 +58,7 @@ class Hypothesis:
     parameters: dict[str, Parameter]
     change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
     runs: tuple[str, ...] = ()
+    choice_cost: float = 0.0
 
     def machine(self, nominal: Machine, deviation: np.ndarray, run: str = "") -> Machine:
         """Return the machine that has it, at a deviation (p,), in a run; by default what all runs share.
@@ -109,11 +112,11 @@ class Hypothesis:
         return known is not None and not self.change and known.model_part in _OPEN
 
     def prior(self, deviation: np.ndarray) -> float:
-        """-2 log of the prior at a deviation (p,), 0 at nominal."""
+        """-2 log of the prior at a deviation (p,), at nominal that of its choice."""
         squares = deviation**2
         if self.has_wide_prior:
             squares = _FREEDOM * np.log1p(squares / _FREEDOM)
-        return float(np.sum(squares))
+        return float(np.sum(squares)) + self.choice_cost
 
     def prior_weight(self, deviation: np.ndarray) -> np.ndarray:
         """(p,) precision of the normal prior that pulls a deviation (p,) as hard as the prior."""
@@ -156,7 +159,7 @@ class Hypothesis:
 
     def held(self, deviation: np.ndarray) -> "Hypothesis":
         """The same with its numbers fixed at a deviation (p,): none is left to fit."""
-        return _Held(self.name, self.location, {}, self.change, self.runs, self, deviation)
+        return _Held(self.name, self.location, {}, self.change, self.runs, 0.0, self, deviation)
 
     def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
