@@ -48,7 +48,7 @@ class Hypothesis:
     common, and what is rare, as an inertia ten times the model's, is no reason to prefer three
     other effects of common size.
 
-    `choice_cost` is -2 log of the prior probability of a choice that was made with the data, such as that of an interval.
+    `choice_cost` is -2 log of the prior probability of a choice made with the data, such as that of an interval.
 
     With `runs`, it acts in these runs only. A parameter `RUN` or `RUN: NAME` belongs to that run alone.
     """
