@@ -53,6 +53,8 @@ class Hypothesis:
     common, and what is rare, as an inertia ten times the model's, is no reason to prefer three
     other effects of common size.
 
+    `choice_cost` is -2 log of the prior probability of a choice made with the data, such as that of an interval.
+
     With `runs`, it acts in these runs only. A parameter `RUN` or `RUN: NAME` belongs to that run alone.
     """
 
@@ -61,6 +63,7 @@ class Hypothesis:
     parameters: dict[str, Parameter]
     change: Callable[[Machine, Mapping[str, float]], Machine] | None = None
     runs: tuple[str, ...] = field(default=(), kw_only=True)
+    choice_cost: float = field(default=0.0, kw_only=True)
 
     def machine(self, nominal: Machine, deviation: np.ndarray, run: str = "") -> Machine:
         """Return the machine that has it, at a deviation (p,), in a run; by default what all runs share.
@@ -114,11 +117,11 @@ class Hypothesis:
         return known is not None and not self.change and known.model_part in _OPEN
 
     def prior(self, deviation: np.ndarray) -> float:
-        """-2 log of the prior at a deviation (p,), 0 at nominal."""
+        """-2 log of the prior at a deviation (p,), at nominal that of its choice."""
         squares = deviation**2
         if self.has_wide_prior:
             squares = _FREEDOM * np.log1p(squares / _FREEDOM)
-        return float(np.sum(squares))
+        return float(np.sum(squares)) + self.choice_cost
 
     def prior_weight(self, deviation: np.ndarray) -> np.ndarray:
         """(p,) precision of the normal prior that pulls a deviation (p,) as hard as the prior."""

@@ -29,6 +29,7 @@ _PULSE = ("size", "start", "duration")  # parameters of an effect of limited dur
 _PERIODIC_STD = 0.03  # of the largest force, as the prior of a pulse
 _WAVES = ("cosine", "sine")  # parameters of a periodic force in one run, which are also functions of a formula
 _INSTANTS = 160  # of a run at which a pulse may start or end; its refinement is continuous
+_CHOICE_OF_INTERVAL = 2.0 * math.log(0.5 * _INSTANTS * (_INSTANTS - 1))  # all are equally probable
 _MIN_CYCLES = 3.0  # in a run, of a periodic force; a slower one is a law of the time
 _MIN_ROWS = 4.0  # of a period: a faster one does not show in rows
 
@@ -96,10 +97,11 @@ def _periodic_force(
     (largest,), (unit,) = input_sizes(data.machine, [acts]), input_units(data.machine, [acts])
     amplitude = Parameter(unit, 0.0, -largest, largest, _PERIODIC_STD * largest, 0.1 * _PERIODIC_STD * largest)
     names = tuple(run.name for run in (*data.fit, data.heldout))
-    width = best**2 / longest
+    width, choice = best**2 / longest, 2.0 * math.log(len(frequencies))  # all are equally probable
     table = {"period": Parameter("s", best, max(best - 2.0 * width, 0.5 * best), best + 2.0 * width, width, 0.0)}
     table |= {f"{run}: {part}": amplitude for run in names for part in _WAVES}
-    return Hypothesis(PERIODIC_FORCE, acts.axis, table, partial(_add_periodic_force, acts.axis), runs=names)
+    add = partial(_add_periodic_force, acts.axis)
+    return Hypothesis(PERIODIC_FORCE, acts.axis, table, add, runs=names, choice_cost=choice)
 
 
 def _row_gain(frequencies: np.ndarray) -> np.ndarray:
@@ -177,10 +179,11 @@ def _locate_pulse(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]:
         table[key] = replace(
             table[key], nominal=value, prior_std=seconds, lower_bound=low, upper_bound=high, start_values=()
         )  # fmt: skip
-    located = replace(h, parameters={key: replace(p, start_values=()) for key, p in table.items()})
+    table = {key: replace(p, start_values=()) for key, p in table.items()}
+    located = replace(h, parameters=table, choice_cost=_CHOICE_OF_INTERVAL)
     mean = float(pull[first, last] / precision[first, last])
     deviation = np.array([mean if key == "size" else 0.0 for key in table])
-    return (located, np.clip(deviation, located.low, located.high)), float(factors[first, last])
+    return (located, np.clip(deviation, located.low, located.high)), float(factors[first, last]) - _CHOICE_OF_INTERVAL
 
 
 def _compare_waves(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]:
@@ -197,4 +200,4 @@ def _compare_waves(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]
     factors, (mean,) = compare_groups(np.array([0, len(sized)]), right, [block])
     deviation = np.zeros(h.size)
     deviation[sized] = mean
-    return (h, np.clip(deviation, h.low, h.high)), float(factors[0])
+    return (h, np.clip(deviation, h.low, h.high)), float(factors[0]) - h.choice_cost

@@ -288,7 +288,7 @@ def find_gap(
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
-                s.hypothesis.values(s.start),
+                s.hypothesis.values(s.start), {key: p.unit for key, p in s.hypothesis.parameters.items()},
             )
             for s in found.ranking[:15]
         ),

@@ -39,7 +39,7 @@ def rig_evidence():
 
 
 def test_the_responses_of_a_law_are_those_of_its_term(rig_evidence):
-    """The linearised filter predicts what simulating the term changes in the errors, for a force and for a flow through the piston.
+    """The linearised filter predicts what simulating the term changes, for a force and a flow through the piston.
 
     A law that changes much with the velocity within a row, as friction does where the motion turns, is met less well.
     """

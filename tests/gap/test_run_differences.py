@@ -13,6 +13,7 @@ from hydrotele.gap.regression import NormalEquations, compare_groups, split_colu
 from hydrotele.gap.result import gap_document
 from hydrotele.gap.run_differences import between_runs, list_quantities, rescale_between_runs
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.show.gap_report import write_report
 from hydrotele.terms.term import Term
 from tests.gap.test_regression import _log_density
 from tests.small_machines import simulate_data
@@ -79,21 +80,21 @@ def test_friction_that_differs_between_runs_is_found_and_transfers_to_another_ru
     viscous = rig.axes["slide"].cylinder.friction.viscous
     ratios = {"run_0": 1.35, "run_1": 0.7, "run_2": 1.05, "run_3": 1.3}
     own = [rig.replace("axes.slide.cylinder.friction.viscous", viscous * k) for k in ratios.values()]
-    gap = find_gap(_simulate(own), effects=("viscous_friction", "pressure_offset"), jobs=1, method="regression")
+    gap = find_gap(_simulate(own, 350), effects=("viscous_friction",), jobs=1, method="regression")
     assert gap.verdict == "no_gap"
     (difference,) = gap.differences
     assert difference.name == _VISCOUS
     for run, (size, width) in difference.runs.items():
         # four standard deviations of five estimates: a chance of 1 in 3000
         assert abs(size - viscous * (ratios[run] - 1.0)) < 4.0 * width
-    assert gap.size.after < 1.05  # the white noise of 1500 readings: 2 %
+    assert gap.size.after < 1.05  # the white noise of 1050 readings: 2 %
     sampled = gap.posterior.samples[:, gap.posterior.names.index(_VISCOUS)]
     assert np.std(sampled) > 0.8 * difference.deviation  # samples hold for a new run; of 200, truncated at 0
     (document,) = gap_document(gap)["run_differences"]
     assert document["name"] == _VISCOUS
 
 
-def test_a_pulse_in_one_run_is_named_with_run_and_time_and_one_in_the_held_out_run_is_reported():
+def test_a_pulse_in_one_run_is_named_and_one_in_the_held_out_run_is_reported(tmp_path):
     rig = load_machine("rig")
     pulsed = [
         apply_effect(rig, "force_pulse", "slide", {"size": size, "start": start, "duration": 0.6})
@@ -111,6 +112,8 @@ def test_a_pulse_in_one_run_is_named_with_run_and_time_and_one_in_the_held_out_r
     (difference,) = gap.differences
     assert difference.name == "force_pulse.slide" and list(difference.runs) == ["run_0"]
     assert difference.runs["run_0"][0] == pytest.approx(300.0, rel=0.05)  # five standard deviations
+    write_report(gap, tmp_path / "report.html")
+    assert "force pulse of the slide run 2" in (tmp_path / "report.html").read_text().lower()
     assert any("Run run_0 differs from the fitted runs: force_pulse.slide" in note for note in gap.notes)
 
 
