@@ -47,7 +47,8 @@ _LOG_SIZES = (-6.0, 9.0)  # between which that log is looked for
 _STEPS = 6  # Gauss-Newton steps
 _SETTLED = 1.0  # twice the log likelihood; a smaller change ends the alternation of fits and noise levels
 _KNOTS = {1: 12, 2: 7}  # hat functions of a law along each of its one or two variables
-_QUANTILES = (0.005, 0.995)  # of a variable, between which the knots lie
+QUANTILES = (0.005, 0.995)
+"""Quantiles of a variable, between which the knots of hat functions lie."""
 
 
 class NoiseShape(NamedTuple):
@@ -138,7 +139,7 @@ def _hats(series: Sequence[np.ndarray]) -> np.ndarray:
     """Hat functions (n, l) of one or two variables (n,), or their products."""
     weights = np.ones((len(series[0]), 1))
     for values in series:
-        low, high = np.quantile(values, _QUANTILES)
+        low, high = np.quantile(values, QUANTILES)
         points = np.linspace(low, high, _KNOTS[len(series)])
         weights = (weights[:, :, None] * hat_weights(values, points)[:, None, :]).reshape(len(values), -1)
     return weights

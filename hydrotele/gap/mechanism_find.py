@@ -4,6 +4,7 @@ The search is that of any machine (`gap.model_search`), on inverse dynamics (`ga
 written into the MJCF and its mapping, and that patched model is judged on a run that was not fitted.
 """
 
+import math
 import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import t as student_t
 from threadpoolctl import threadpool_limits
 
 from hydrotele.core.errors import InputError
@@ -24,7 +26,7 @@ from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
 from hydrotele.gap.find import Progress, verdict_of, without_details
-from hydrotele.gap.force_evidence import ForceEvidence, NoiseShape, calibration_of, estimate_noise
+from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, calibration_of, estimate_noise
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
     TYPICAL,
@@ -385,7 +387,11 @@ def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) 
 
 
 def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
-    """Effects with one parameter that differs from run to run or along them -> a sentence."""
+    """Return effects with one parameter whose mean over the runs is not known, because they differ -> a sentence.
+
+    They are rejected if the 95 % interval of the mean, by Student's distribution, holds 0. Of a single run, its parts
+    take the place of the runs.
+    """
     told: dict[Key, str] = {}
     columns = evidence.columns
     runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
@@ -396,7 +402,14 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
         ratios = 1.0 + values[0]
-        if factors[0] > MIN_LOG_BAYES_FACTOR:
+        each = ratios
+        if (count := len(columns.runs)) > 1:
+            low, high = np.quantile(runs * last + columns.time, QUANTILES)
+            of_run = (np.linspace(low, high, len(ratios)) // last).astype(int)
+            each = np.array([ratios[of_run == run].mean() for run in range(count) if np.any(of_run == run)])
+        error = np.std(each, ddof=1) / math.sqrt(len(each))
+        is_known = abs(each.mean()) > student_t.ppf(0.975, len(each) - 1) * error
+        if factors[0] > MIN_LOG_BAYES_FACTOR and not is_known:
             told[hypothesis.key] = _DIFFERS.format(*hypothesis.key, ratios.min(), ratios.max(), factors[0])
     return told
 
