@@ -147,9 +147,12 @@ class MachineModel(GapModel):
 
         Slow noise of several sensors is explained by residual inputs as well, and each channel alone then shows too
         little of it. So all channels get a first-order part at once, and the residual inputs must bring their evidence
-        anew. Coloured noise that was found before an effect that changes the spectra is looked for again.
+        anew. Coloured noise that was found before an effect that changes the spectra is looked for again. Without
+        residual inputs and coloured noise nothing of this can be hidden.
         """
         evidence, levels = self.evidence, judged.tracks[0].levels
+        if not levels.inputs and not levels.colours:
+            return judged
         total, shares = levels.noise.copy(), np.full(len(levels.noise), np.sqrt(0.5))
         for colour in levels.colours:
             total[colour.channel] = np.hypot(total[colour.channel], colour.size)
