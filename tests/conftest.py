@@ -13,6 +13,7 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+from matplotlib import layout_engine
 
 # Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
 # the suite say so, and tools/nightly has a check `learn`, which runs them with it.
@@ -65,6 +66,7 @@ def _share_machines():
 _share_machines()
 gc.set_threshold(100_000, 50, 100)  # a full collection of all that the suite has imported takes seconds
 report_html._DPI = 50  # pictures of reports are drawn in a third of the time
+layout_engine.ConstrainedLayoutEngine.execute = lambda self, figure: None  # and without layout in half of that
 
 # No deadline: the first example pays for numba's compilation. The same examples each time, so
 # that a red run can be repeated. tools/nightly draws new ones, twenty times as many.
