@@ -370,8 +370,8 @@ def test_one_lost_window_says_little_and_what_is_below_noise_nothing(monkeypatch
     monkeypatch.setattr(discover, "machine_runner", lambda *_: lambda run: None)
     monkeypatch.setattr(discover, "free_run_errors", lambda *_, to_end: found)
     evidence: Any = SimpleNamespace(data=SimpleNamespace(machine=None), map=lambda f, x: [*map(f, x)])
-    judged: Any = SimpleNamespace(guess=SimpleNamespace(machine=lambda machine: machine))
-    run: Any = None
+    judged: Any = SimpleNamespace(guess=SimpleNamespace(machine=lambda machine, run: machine))
+    run: Any = SimpleNamespace(name="run")
     ahead = discover.open_loop(evidence, [run], judged, np.ones(2))
     assert ahead.usual == pytest.approx(1000.0**0.1) and ahead.rms == np.inf
     assert np.isnan(ahead.far)
