@@ -360,11 +360,11 @@ def gap(
     model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
-                       "--force": force, "--method": method != "search"}  # fmt: skip
+                       "--force": force}  # fmt: skip
         if strange := [option for option, value in of_machines.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
-        gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [])
+        gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [], method)
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,

@@ -29,9 +29,10 @@ from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.estimate.residual_force import whiten_forces
 from hydrotele.estimate.track import Levels
 from hydrotele.gap.dictionary import Version
+from hydrotele.gap.force_columns import ForceEffect
 from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm
-from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
+from hydrotele.gap.mechanism_columns import TYPICAL, Columns, strengths
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 from hydrotele.identify.linear_least_squares import fit_autoregression
@@ -248,7 +249,7 @@ class ForceEvidence(GapModel):
         """Return what a guess adds along all columns (m,)."""
         out = np.zeros(len(self._place))
         for hypothesis, deviation in guess.parts:
-            assert isinstance(hypothesis, MechanismEffect)
+            assert isinstance(hypothesis, ForceEffect)
             values = np.array(list(hypothesis.values(deviation).values()))
             np.add.at(out, [self._place[name] for name in hypothesis.columns], hypothesis.coefficients(values))
         return out
@@ -368,7 +369,7 @@ class ForceEvidence(GapModel):
         """Return the uncertain parameters of the MJCF, without those of effects with one parameter."""
         if any(h.name == CALIBRATION for h in guess.hypotheses):
             return Hypothesis(CALIBRATION, "all", {})
-        taken = {h.columns[0] for h in guess.hypotheses if isinstance(h, MechanismEffect) and h.size == 1}
+        taken = {h.columns[0] for h in guess.hypotheses if isinstance(h, ForceEffect) and h.size == 1}
         group = self._uncertain
         table = {n: replace(p, prior_std=scale * p.prior_std) for n, p in group.parameters.items() if n not in taken}
         return calibration_of(table)
@@ -510,10 +511,10 @@ class ForceLinearisation:
         return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
 
 
-def calibration_of(parameters: dict) -> MechanismEffect:
+def calibration_of(parameters: dict) -> ForceEffect:
     """Return the uncertain parameters of a model, column -> prior, as one effect."""
     nominal = np.array([p.nominal for p in parameters.values()])
-    return MechanismEffect(
+    return ForceEffect(
         CALIBRATION, "all", parameters, None, tuple(parameters), lambda values: values - nominal,
     )  # fmt: skip
 

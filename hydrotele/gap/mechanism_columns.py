@@ -16,7 +16,6 @@ from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Parameter
-from hydrotele.estimate.hypothesis import Hypothesis
 from hydrotele.identify.equations import (
     RateErrors,
     apply_low_pass,
@@ -90,6 +89,17 @@ class Columns:
     def gap(self) -> np.ndarray:
         """(n, k) measured less modelled."""
         return self.measured - self.modelled
+
+    def part(self, first: int, last: int) -> "Columns":
+        """Equations `first` to `last`, of one run, as if they were all."""
+        rows = slice(first, last)
+        run = self.runs[int(np.searchsorted(self.starts, first, side="right")) - 1]
+        return replace(
+            self, matrix=self.matrix[rows], measured=self.measured[rows],
+            modelled=self.modelled[rows], time=self.time[rows], starts=(0, last - first),
+            doubt=self.doubt[rows], runs=(run,),
+            states={name: values[rows] for name, values in self.states.items()},
+        )  # fmt: skip
 
     def moved(self, value: Mapping[str, float]) -> "Columns":
         """Columns whose model has some coefficients, column -> value, added."""
@@ -448,25 +458,52 @@ _FORM = 0.2  # of a drive's dry friction, which its form near rest may change
 _NONE = 1e-9  # share that has no effect
 _ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
 _NOTABLE = 0.2  # of a body's moments of inertia that is worth naming, little as forces may change
-_LATE_STEP = 0.02  # s, typical delay of a sensor, and its largest change from round to round
 _SECOND = 0.1  # s, beyond which no sensor is late
 
 Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
-class MechanismEffect(Hypothesis):
-    """An effect at a joint, a drive, a body, `force` or `base`, as a combination of columns.
+class MechanismEffect:
+    """An effect at a place.
 
     Attributes:
+        name: see `SENTENCES`.
+        location: a joint, a drive, a body, `force` or `base`.
+        parameters: name -> number, with its prior (`scale` about `start`) and its bounds.
         columns: those that it acts through.
-        coefficients: (p,) parameter values -> (c,) what they add to the given model along the columns.
+        coefficients: (p,) parameters -> (c,) what they add to the given model along the columns.
+        start: (p,) mean of the prior.
         variant: number of the form, where there are several.
     """
 
-    columns: tuple[str, ...] = ()
-    coefficients: Callable[[np.ndarray], np.ndarray] = lambda values: values
+    name: str
+    location: str
+    parameters: Mapping[str, Parameter]
+    columns: tuple[str, ...]
+    coefficients: Callable[[np.ndarray], np.ndarray]
+    start: np.ndarray
     variant: int = 0
+
+    @property
+    def key(self) -> Key:
+        """Name and place."""
+        return self.name, self.location
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(p,) standard deviations of the prior."""
+        return np.array([one.prior_std for one in self.parameters.values()])
+
+    @property
+    def low(self) -> np.ndarray:
+        """(p,) smallest values."""
+        return np.array([one.lower_bound for one in self.parameters.values()])
+
+    @property
+    def high(self) -> np.ndarray:
+        """(p,) largest values."""
+        return np.array([one.upper_bound for one in self.parameters.values()])
 
 
 def strengths(columns: Columns) -> np.ndarray:
@@ -545,7 +582,8 @@ class _Builder:
         if facts is None:
             return None
         return MechanismEffect(
-            name, place, {parameter: facts}, None, (column,), lambda p: p - nominal, variant,
+            name, place, {parameter: facts}, (column,), lambda p: p - nominal, np.array([nominal]),
+            variant,
         )  # fmt: skip
 
     def units(self, joint: str) -> tuple[str, str, str, str]:
@@ -602,12 +640,9 @@ class _Builder:
         def coefficients(p: np.ndarray) -> np.ndarray:
             return np.array([p[0] - stiff, p[0] * (middle - p[1]) - stiff * (middle - rest)])
 
-        start = stiff + facts.prior_std
-        facts = replace(facts, start_values=(start, start, start))
-        slack = replace(slack, start_values=(centre, centre - travel, centre + travel))
         return MechanismEffect(
-            "joint_spring", drive, {"stiffness": facts, "rest": slack}, None,
-            (f"spring.{drive}", f"offset.{drive}"), coefficients,
+            "joint_spring", drive, {"stiffness": facts, "rest": slack},
+            (f"spring.{drive}", f"offset.{drive}"), coefficients, np.array([stiff, centre]),
         )  # fmt: skip
 
     def bodies(self):
@@ -635,18 +670,19 @@ class _Builder:
         if share < _NONE:
             return None
         scale = TYPICAL / share
-        aside = np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])  # where a load is looked for, in radii of gyration
-        loads = tuple(sign * scale for sign in (1.0, -1.0) for _ in aside)
-        load = Parameter("kg", 0.0, -0.9 * mass, _MOST * scale, scale, LEAST / share, loads)
+        load = Parameter("kg", 0.0, -0.9 * mass, _MOST * scale, scale, LEAST / share)
         place = {
-            axis: Parameter("m", c, c - 3.0 * size, c + 3.0 * size, size, 0.0, tuple(c + size * way) * 2)
-            for axis, c, way in zip("xyz", centre.tolist(), aside.T, strict=True)
+            axis: Parameter("m", c, c - 3.0 * size, c + 3.0 * size, size, 0.0)
+            for axis, c in zip("xyz", centre.tolist(), strict=True)
         }
 
         def coefficients(p: np.ndarray) -> np.ndarray:
             return np.concatenate([[p[0]], p[0] * p[1:], p[0] * _point(p[1:])])
 
-        return MechanismEffect("payload", body, {"mass": load, **place}, None, names, coefficients)
+        return MechanismEffect(
+            "payload", body, {"mass": load, **place}, names, coefficients,
+            np.concatenate([[0.0], centre]),
+        )  # fmt: skip
 
     def moved(self, body, names, mass, centre, size) -> MechanismEffect | None:
         share = mass * max(self.strength[n] for n in names[:3])
@@ -659,7 +695,7 @@ class _Builder:
             change = mass * (_point(centre + p) - _point(centre))
             return np.concatenate([mass * p, change])
 
-        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), None, names, coefficients)
+        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3))
 
     def turned(self, body, names, own) -> MechanismEffect | None:
         upper = own[np.triu_indices(3)]
@@ -669,7 +705,10 @@ class _Builder:
         scale = min(TYPICAL / share, 1.0)
         least = min(LEAST / share, _NOTABLE)
         ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
-        return MechanismEffect("inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper)
+        return MechanismEffect(
+            "inertia_error", body, {"ratio": ratio}, names, lambda p: (p[0] - 1.0) * upper,
+            np.ones(1),
+        )  # fmt: skip
 
     def sensors(self):
         """Defects of sensors, and the base."""
@@ -690,12 +729,8 @@ class _Builder:
         facts = self.number(column, "s")
         if facts is None:
             return None
-        known = float(self.applied.get((name, place), [0.0])[0])
-        reach = min(facts.prior_std, _LATE_STEP)  # its column is a small difference: it holds near the known delay
-        facts = Parameter(
-            "s", 0.0, max(low, known - reach), min(_SECOND, known + reach), reach, facts.min_relevant_change
-        )
-        return MechanismEffect(name, place, {"delay": facts}, None, (column,))
+        facts = Parameter("s", 0.0, low, _SECOND, min(facts.prior_std, 0.02), facts.min_relevant_change)
+        return MechanismEffect(name, place, {"delay": facts}, (column,), lambda p: p, np.zeros(1))
 
     def scale(self, drive: str) -> MechanismEffect | None:
         column = f"scale.force.{drive}"
@@ -707,9 +742,9 @@ class _Builder:
             "force_scale",
             drive,
             {"scale": facts},
-            None,
             (column,),
             lambda p: (p - 1.0) / known,
+            np.ones(1),
         )
 
     def tilt(self) -> MechanismEffect | None:
@@ -717,7 +752,10 @@ class _Builder:
         if share < _NONE:
             return None
         way = Parameter("rad", 0.0, -0.3, 0.3, 0.03, LEAST / share)
-        return MechanismEffect("base_tilt", "base", {"x": way, "y": way}, None, ("tilt.x", "tilt.y"))
+        return MechanismEffect(
+            "base_tilt", "base", {"x": way, "y": way}, ("tilt.x", "tilt.y"), lambda p: p,
+            np.zeros(2),
+        )  # fmt: skip
 
 
 def _point(place: np.ndarray) -> np.ndarray:

@@ -1,35 +1,24 @@
 """The gap of a mechanism without hydraulics: from measured motion and forces to a Gap.
 
-The search is that of any machine (`gap.model_search`), on inverse dynamics (`gap.force_evidence`). What it names is
-written into the MJCF and its mapping, and that patched model is judged on a run that was not fitted.
+Calibrate what may be off, name what differs, patch the MJCF, judge the patched model on a run that
+was not fitted, and say what is left.
 """
 
-import math
 import tempfile
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student_t
-from threadpoolctl import threadpool_limits
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.mjcf import read_mjcf
-from hydrotele.effects.effect import Parameter
-from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess
-from hydrotele.gap.answer import answer_document, answer_words
-from hydrotele.gap.description import describe
-from hydrotele.gap.explanation import compare_contenders
-from hydrotele.gap.find import Progress, verdict_of, without_details
-from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, calibration_of, estimate_noise
+from hydrotele.gap.description import channel_words, lack_words
+from hydrotele.gap.find import Progress, detail_words, verdict_of, without_details
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
-    TYPICAL,
     Columns,
     Key,
     MechanismEffect,
@@ -39,7 +28,22 @@ from hydrotele.gap.mechanism_columns import (
     separate_setup,
     undone,
 )
-from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
+from hydrotele.gap.mechanism_evidence import (
+    Evidence,
+    Fitted,
+    Left,
+    Noise,
+    effects_by_part,
+    find_left,
+    find_noise,
+    gather_evidence,
+    loud_windows,
+    noise_of,
+    possible_errors,
+    row_weights,
+    whitened,
+    with_variation,
+)
 from hydrotele.gap.patched import (
     COLUMNS_FILE,
     MJCF_FILE,
@@ -49,46 +53,45 @@ from hydrotele.gap.patched import (
     sensor_errors,
     write_mechanism,
 )
-from hydrotele.gap.residuals import believed_part
 from hydrotele.gap.result import (
-    LIKELY,
     Alternative,
     Candidate,
     Estimate,
     Gap,
     GapSize,
-    InputTrace,
     Lack,
     NamedEffect,
     Prediction,
-    Rejection,
-    VerdictExplanation,
+    Unknown,
 )
-from hydrotele.gap.rivals import effect_probabilities
-from hydrotele.gap.search import Found
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.multibody.regressor import BODY_PARAMETERS
 
-MIN_FORCE_SHARE = 0.02
-"""Fraction of the RMS force of a drive below which a residual force is no gap: models of friction are no better."""
-_MAX_ROUNDS = 4  # of taking sensor errors off the readings and searching again
-_UNCHANGED = 0.01  # prior standard deviations; a smaller change of the sensor errors ends these rounds
-_FORM = 0.1  # of a drive's dry friction, by which its form near rest may differ: presliding is not in the model
-_SHARPNESS = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
-_WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
-_MIN_PROBABILITY = 0.005  # below which an alternative is not listed
-_DISTINCT = 3.0  # standard deviations from which a calibrated parameter is listed
+_ODDS = 6.0  # twice the log odds by which naming an effect must beat not naming it, beside the
+# number of effects that are tried
+_MOST = 20  # effects
+_SCARCE = 5.0  # equations per column, below which all columns together tell noise too small
+_FEW = 3  # effects up to which exchanges are tried after every new one
+_ROUNDS = 4  # of taking sensors' defects off the readings
+_SAME = 0.01  # of a prior's width, within which a round has changed nothing
+_BETTER = 1e-3  # by which an exchange must be better
+_WORTH_TELLING = 0.005
+_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the stated uncertainty that are tried: how far the numbers
+# are off is found, too
+_CALIBRATED = 10.0  # twice the log odds from which numbers of the model count as off
+_TOLD = 3.0  # standard deviations from which a calibrated number is told
 _NORMAL95 = 1.96
+_SPOILT = -4.0  # standard deviations by which an effect may better the held-out run too little
+_WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
     "The changes found on the fitted runs increase the errors on the held-out run; they were"
     " rejected, and no effect is named."
 )
-_DIFFERS = (
-    "{} at {}, found on the fitted runs, differs between parts of these runs ({:.2g} to {:.2g} times the fitted value,"
-    " twice the log Bayes factor against a constant value {:.0f}); it was rejected."
-)
-_HELD_OUT_ONLY = "A force of {:.3g} {} RMS acts on {} in the held-out run {} alone; the fitted runs do not show it."
+_SPOILS = "{} at {}, found on the fitted runs, increases the errors on the held-out run; it was rejected."
+_DIFFERS = "{} at {}, found on the fitted runs, differs between parts of these runs ({} {} {}); it was rejected."
+_TURNS = 0.05  # doubt of a sign from which what is left may be the form of dry friction near rest
+_LISTED = 3  # notes of that kind
 METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
 
 
@@ -109,61 +112,82 @@ class MechanismModel:
     tool: str = ""
 
 
-class _Task(NamedTuple):
-    """The given model and the runs."""
+@dataclass(frozen=True)
+class _Found:
+    """Result of a search: evidence, all candidates, and the chosen ones fitted together.
+
+    `off` are the standard deviations of the numbers that `evidence` integrates out. `weak` would be
+    chosen but for their size, and are `refused` with others that are not needed.
+    """
+
+    columns: Columns
+    noise: Noise
+    evidence: Evidence
+    effects: list[MechanismEffect]
+    fitted: Fitted
+    weak: tuple[Fitted, ...]
+    singles: list[Fitted]
+    refused: frozenset[Key]
+    off: dict[str, float]
+
+    @property
+    def total(self) -> float:
+        """Twice the log evidence of the numbers' errors and the effects together."""
+        return self.evidence.evidence + self.fitted.score
+
+    def coefficients(self) -> np.ndarray:
+        """(m,) what effects and calibrated numbers add along all columns."""
+        evidence = self.evidence
+        value = evidence.coefficients(self.fitted)
+        deviation, _ = evidence.calibrated(self.fitted)
+        value[[evidence.places[name] for name in evidence.calibrate]] += deviation
+        return value
+
+
+class _Patching(NamedTuple):
+    """What it takes to patch the model and to judge it on the held-out run."""
 
     mjcf: str | Path
     mechanism: Mechanism
     given: MechanismModel
     nominal: Mapping[str, float]
-    fit: Sequence[IdentificationRecord]
     heldout: IdentificationRecord
     band: float
-
-    @property
-    def drives(self) -> tuple[str, ...]:
-        return tuple(self.mechanism.setup.chain.drives)
-
-    def unit(self, joint: str) -> str:
-        chain = self.mechanism.setup.chain
-        return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
-
-    def effects_of(self, guess: Guess) -> list[tuple[MechanismEffect, np.ndarray]]:
-        """Effects of a guess with their parameter values, without the calibration."""
-        return [(h, np.array(list(h.values(d).values()))) for h, d in guess.parts
-                if h.name != CALIBRATION and isinstance(h, MechanismEffect)]  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Result:
-    """A model, fitted, and what the held-out run says of it.
-
-    Attributes:
-        guess: the model.
-        judged: on the fitted runs.
-        patched: the MJCF with it.
-        then: held-out columns of the given model.
-        now: of the patched one.
-        sizes: (2, k) residual forces of the fitted runs and of the held-out run [N] or [N m]; 0 where no evidence.
-    """
-
-    judged: Judged
-    patched: MechanismModel
     then: Columns
-    now: Columns
-    sizes: np.ndarray
 
-    def share(self) -> np.ndarray:
-        """(2, k) residual forces over the RMS of the drives' forces."""
-        return self.sizes / np.sqrt(np.mean(self.then.measured**2, axis=0))
+    def of(self, found: _Found) -> tuple[MechanismModel, dict[str, Estimate], "_Judged"]:
+        """The patched model, the calibrated numbers, and what the held-out run says of both."""
+        mechanism = self.mechanism
+        chosen = list(zip(found.fitted.effects, found.fitted.values, strict=True))
+        calibration, numbers = _calibration(mechanism, found, self.nominal)
+        patched, now = self.given, self.then
+        if chosen or numbers:
+            speeds = {joint: size[2] for joint, size in found.columns.sizes.items()}
+            patch = patch_of(
+                chosen, mechanism.setup.chain, mechanism.measured_joints, numbers, self.nominal, speeds
+            )  # fmt: skip
+            patched = replace(
+                self.given, mjcf=patched_mjcf(self.mjcf, patch),
+                mapping=patched_mapping(mechanism.mapping, patch),
+            )  # fmt: skip
+            with tempfile.TemporaryDirectory() as folder:
+                write_mechanism(Path(folder), patched.mjcf, patched.mapping)
+                better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
+            now = build_columns([self.heldout], better, self.band, patch.errors)
+        return patched, calibration, _judged(mechanism, found, self.nominal, self.then, now)
 
-    @property
-    def lacking(self) -> np.ndarray:
-        """(2, k) whether a force is missing in the fitted runs, and in the held-out run."""
-        return self.share() > MIN_FORCE_SHARE
+
+def _emptied(fit, mechanism: Mechanism, band: float, found: _Found) -> _Found:
+    """A search's result without what was chosen: readings and model as they are given."""
+    columns = build_columns(fit, mechanism, band)
+    noise = find_noise(columns)
+    evidence = gather_evidence(columns, noise, {})
+    return replace(
+        found, columns=columns, noise=noise, evidence=evidence, fitted=evidence.fit([]), weak=(),
+        off={},
+    )  # fmt: skip
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # results may not depend on the number of threads
 def find_mechanism_gap(
     mjcf: str | Path, mapping: str | Path | ColumnMapping | None,
     fit: Sequence[IdentificationRecord], heldout: IdentificationRecord,
@@ -194,72 +218,93 @@ def find_mechanism_gap(
             f"is not an effect of mechanisms; valid: {', '.join(sorted(SENTENCES))}",
         )
     mechanism = load_mechanism(mjcf, mapping)
-    given = MechanismModel(mechanism.setup.chain.name, read_mjcf(mjcf).flatten(), mechanism.mapping)
+    band = common_band(fit, mechanism)
     nominal = nominal_parameters(mechanism)
-    task = _Task(mjcf, mechanism, given, nominal, fit, heldout, common_band(fit, mechanism))
-    evidence, found = _search(task, effects, tell)
-    tell("evaluate the patched model on the held-out run", 0.9)
-    chances = _probabilities(evidence, found)
-    small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
-             for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
-    judged, untrue = _without(evidence, found.judged, small), list(small.values())
-    varying: dict[Key, str] = {}
-    while varying := _varying(evidence, judged):
-        untrue += varying.values()
-        judged = _without(evidence, judged, varying)
-    details: tuple[NamedEffect, ...] = ()
-    then = build_columns([heldout], mechanism, task.band)
-    result = _evaluate(task, evidence, judged, then)
-    while True:
-        if not _error_ratio(task, evidence, result) <= _WORSE:
-            untrue.append(_REJECTED)
-            evidence, found = _unfitted(task)
-            result = _evaluate(task, evidence, found.judged, then)
-        named = _named(task, evidence, result, chances)
-        named, more = without_details(named, bool(result.lacking.any()), task.drives)
-        unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
-        named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
-        details += more
-        if not more:
-            break
-        judged = _without(evidence, result.judged, {(e.name, e.location) for e in more})
-        result = _evaluate(task, evidence, judged, then)
-    shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
-    before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
-    lacks = _lacks(task, result)
+    found = _searched(fit, mechanism, band, nominal, effects, tell)
+    tell("patch the model and evaluate it on the held-out run", 0.8)
+    given = MechanismModel(mechanism.setup.chain.name, read_mjcf(mjcf).flatten(), mechanism.mapping)
+    then = build_columns([heldout], mechanism, band)
+    patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
+    found, untrue, varies = _constant(found)
+    notes = (*notes, *untrue)
+    patched, calibration, judged = patching.of(found)
+    while judged.spoiling:
+        worst = min(judged.spoiling, key=judged.spoiling.__getitem__)
+        notes = (*notes, _SPOILS.format(*worst))
+        found = _without(found, [worst])
+        patched, calibration, judged = patching.of(found)
+    if not _rms(judged.after[0]) <= _WORSE * _rms(judged.before[0]):
+        notes = (*notes, _REJECTED)
+        found, patched, calibration = _emptied(fit, mechanism, band, found), given, {}
+        judged = _judged(mechanism, found, nominal, then, then)
+    judged = judged._replace(left=with_variation(judged.left, varies, judged.std))
+    named = _named(found, judged.shares)
+    named, details = _believable(named, judged)
+    left = judged.left
+    verdict = verdict_of(named, bool(left.lacking.any()), 1.0)
+    lacks = _lacks(mechanism, left, then)
     unknown = None
-    if lacks:
-        unknown = describe(lacks, (), after)
-        depends = _dependence(evidence, result)
-        unknown = replace(unknown, depends_on=depends, channel=_channels(task)[task.drives.index(lacks[0].axis)])
-    rms = [np.sqrt(np.nanmean(one[0].whitened ** 2, axis=0)) for one in (before, after)]
-    total = [float(np.sqrt(np.mean(one**2))) for one in rms]
-    more = [
-        f"Forces are compared below {task.band:.3g} Hz.",
-        *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
-    ]
-    more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
-             for k, drive in enumerate(task.drives) if result.lacking[1, k] and not result.lacking[0, k]]  # fmt: skip
-    more += [words for effect in named if (words := answer_words(effect))]
+    if left.lacking.any():
+        unknown = _unknown(left, lacks, judged.after[0])
+    channels = judged.before[0].channels
     tell("done", 1.0)
     return Gap(
-        machine=given, patched=result.patched, verdict=verdict_of(named, bool(result.lacking.any()), 1.0),
-        effects=named, unknown=unknown, size=GapSize(total[0], total[1], 1.0, METRIC), ranking=_ranking(found),
-        before=before, after=after,
+        machine=given, patched=patched, verdict=verdict, effects=named, unknown=unknown,
+        size=GapSize(_rms(judged.before[0]), _rms(judged.after[0]), 1.0, METRIC),
+        ranking=_ranking(found), before=judged.before, after=judged.after,
         laws={"force": {
-            drive: {"before": float(a * std), "after": float(b * std), "noise": float(std)}
-            for drive, a, b, std in zip(task.drives, *rms, shape.std, strict=True)
+            drive: {
+                "before": float(one * std), "after": float(other * std), "noise": float(std),
+            } for drive, one, other, std in zip(
+                mechanism.setup.chain.drives, _channel_rms(judged.before[0]),
+                _channel_rms(judged.after[0]), judged.std, strict=True)
         }},
-        law_units={"force": task.unit(task.drives[0])}, tests=_tests(result),
-        calibration=_calibration(task, evidence, result.judged), lacks=lacks,
-        noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
-        notes=(*notes, *untrue, *more), answers=tuple(answer_document(named)),
-        explanation=VerdictExplanation(
-            compare_contenders(found, named), _rejections(found, named, details, untrue),
-            _traces(task, evidence, result),
-        ),
+        law_units={"force": _unit(mechanism, mechanism.setup.chain.drives[0])},
+        tests=left.tests, calibration=calibration, lacks=lacks,
+        noise={channel: (float(std), float("nan"))
+               for channel, std in zip(channels, judged.std, strict=True)},
+        notes=(*notes, *map(detail_words, details), *_notes(found, band)),
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
+
+
+def _without(found: _Found, dropped: Iterable[Key]) -> _Found:
+    """A search's result without some effects, the others fitted again."""
+    dropped, fitted = frozenset(dropped), found.fitted
+    kept = [(e, v) for e, v in zip(fitted.effects, fitted.values, strict=True)
+            if e.key not in dropped]  # fmt: skip
+    fitted = found.evidence.fit([e for e, _ in kept], [v for _, v in kept] or None)
+    return replace(found, fitted=fitted, refused=found.refused | dropped)
+
+
+def _constant(found: _Found) -> tuple[_Found, list[str], np.ndarray]:
+    """A search's result without effects that differ from run to run.
+
+    Returns:
+        The result, what is said of the effects, and (k,) RMS of the drives' forces that these made.
+    """
+    told: list[str] = []
+    moved = np.zeros(found.columns.measured.shape[1])
+    while found.fitted.effects:
+        parts = effects_by_part(found.columns, found.noise, found.off, found.fitted)
+        differ = [k for k, many in enumerate(parts) if many]
+        if not differ:
+            break
+        for k in differ:
+            effect, value = found.fitted.effects[k], found.fitted.values[k]
+            name, facts = next(iter(effect.parameters.items()))
+            own = [float(part[0]) for part in parts[k]]
+            values = f"{min(own):.3g} to {max(own):.3g}"
+            told.append(_DIFFERS.format(*effect.key, name, values, facts.unit))
+            at = [found.evidence.places[column] for column in effect.columns]
+            force = found.columns.matrix[:, :, at] @ effect.coefficients(value)
+            moved = np.hypot(moved, np.sqrt(np.mean(force**2, axis=0)))
+        found = _without(found, [found.fitted.effects[k].key for k in differ])
+    if len(told) > _LISTED:
+        told = [
+            *told[:_LISTED], f"{len(told) - _LISTED} more were rejected for the same reason."
+        ]  # fmt: skip
+    return found, told, moved
 
 
 def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
@@ -285,248 +330,186 @@ def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
     return out
 
 
-def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> MechanismEffect:
-    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping, as one group.
-
-    Args:
-        mechanism: the model.
-        nominal: of `nominal_parameters`.
-
-    Returns:
-        The group. Moments and products of inertia are uncertain relative to the body's mass and size.
-    """
-    off, chain, std = mechanism.mapping.relative_uncertainty, mechanism.setup.chain, {}
-    for body, ten in zip(chain.bodies, chain.inertia, strict=True):
-        mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
-        reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
-        for kind in BODY_PARAMETERS:
-            std[f"{kind}.{body}"] = mass if kind == "mass" else reach if kind.startswith("moment") else spread
-    table = {}
-    for name, value in nominal.items():
-        width = off * std.get(name, abs(value))
-        if width > 0.0:
-            table[name] = Parameter(parameter_unit(mechanism, name), value, -np.inf, np.inf, width, 0.0)
-    return calibration_of(table)
-
-
-def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
-    """Return what no model knows: column -> standard deviation.
-
-    How dry friction acts near rest, and how sharply it turns.
-    """
-    form: dict[str, float] = {}
-    for one in mechanism.setup.friction_terms:
-        dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
-        if one.location in columns.drives and dry > 0.0:
-            form |= {f"stribeck{number}.{one.location}": _FORM * dry for number in (0, 2)}
-            form[f"sharpness.{one.location}"] = _SHARPNESS * dry
-    return form
-
-
-def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvidence, Found]:
-    """Search; take sensor errors off the readings and search again until nothing changes."""
+def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
+    """Search; take sensors' defects off the readings and search again until nothing changes."""
     applied: dict[Key, np.ndarray] = {}
     known: Sequence[tuple[MechanismEffect, np.ndarray]] = ()
-    chain, joints, about = task.mechanism.setup.chain, task.mechanism.measured_joints, {}
-    for turn in range(_MAX_ROUNDS):
-        begin = 0.9 * turn / _MAX_ROUNDS
-        tell(f"compute the regressors of all effects, round {turn + 1}", begin)
-        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(known, chain, joints), about)
+    found, about, shares = None, {}, _SHARES
+    for turn in range(_ROUNDS):
+        tell(f"compute the regressors of all effects, round {turn + 1}", 0.2 * turn)
+        errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured_joints)
+        columns = build_columns(fit, mechanism, band, errors, about)
         columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
-        effects = mechanism_effects(chain, columns, task.nominal, applied)
-        effects = [one for one in effects if not names or one.name in names]
-        evidence = _evidence(task, columns)
-        found = search_model(
-            evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
-        )
-        known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
-        value = evidence.coefficients(found.guess)
-        about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
-        steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
-                 / [p.prior_std for p in h.parameters.values()] for h, v in known]  # fmt: skip
-        if {h.key for h, _ in known} == set(applied) and all(np.all(step < _UNCHANGED) for step in steps):
+        effects = mechanism_effects(mechanism.setup.chain, columns, nominal, applied)
+        if names:
+            effects = [one for one in effects if one.name in names]
+        tell(f"evaluate {len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
+        noise = find_noise(columns)
+        tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
+        choice = 2.0 * np.log(max(len(effects), 1))  # of one effect among all
+        best = int(np.argmax([one.total - choice * len(one.fitted.effects) for one in tried]))
+        found, shares = tried[best], shares[best : best + 1]
+        if columns.gap.size < _SCARCE * len(columns.names):
+            noise = noise_of(_unexplained(found), columns)
+            found = _search(columns, noise, mechanism, shares[0], effects, found)
+        known = [
+            (one, value)
+            for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
+            if sensor_errors([(one, value)], mechanism.setup.chain, mechanism.measured_joints)
+        ]
+        value = found.evidence.coefficients(found.fitted)
+        about = {name: value[k] for k, name in enumerate(columns.names) if name in nominal}
+        steps = [np.abs(value - applied.get(one.key, one.start)) / one.scale for one, value in known]
+        same = {one.key for one, _ in known} == set(applied)
+        if same and max((float(s.max()) for s in steps), default=0.0) < _SAME:
             break
-        applied = {h.key: v for h, v in known}
-    return evidence, found
+        applied = {one.key: value for one, value in known}
+    assert found is not None
+    return found
 
 
-def _evidence(task: _Task, columns: Columns, shape: NoiseShape | None = None) -> ForceEvidence:
-    return ForceEvidence(
-        columns, shape or estimate_noise(columns), uncertain_parameters(task.mechanism, task.nominal),
-        uncertain_form(task.mechanism, columns),
-    )  # fmt: skip
-
-
-def _unfitted(task: _Task) -> tuple[ForceEvidence, Found]:
-    """Evidence on the readings as they are, and a search that found nothing."""
-    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band))
-    judged = evidence.judged(Guess())
-    return evidence, Found(judged, judged, None, (), (), (), (), None)
-
-
-def _is_small(effect: MechanismEffect, values: np.ndarray) -> bool:
-    """Return whether an effect is smaller than its smallest relevant change in all parameters together."""
-    facts = [p for p in effect.parameters.values() if p.min_relevant_change > 0.0]
-    change = [(v - p.nominal) / p.min_relevant_change
-              for v, p in zip(values, effect.parameters.values(), strict=True) if p in facts]  # fmt: skip
-    return float(np.linalg.norm(change)) < 1.0
-
-
-def _not_named(key: Key, values: Mapping[str, float]) -> str:
-    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-    return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
-
-
-def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
-    """Fit a model again without some effects."""
-    if not dropped:
-        return judged
-    parts = tuple(part for part in judged.guess.parts if part[0].key not in dropped)
-    rest = evidence.judged(Guess(parts))
-    return evidence.settle(rest)[0] if parts else rest
-
-
-def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
-    """Return effects with one parameter whose mean over the runs is not known, because they differ -> a sentence.
-
-    They are rejected if the 95 % interval of the mean, by Student's distribution, holds 0. Of a single run, its parts
-    take the place of the runs.
-    """
-    told: dict[Key, str] = {}
-    columns = evidence.columns
-    runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
-    last = columns.time.max()
-    for hypothesis, deviation in judged.guess.parts:
-        if hypothesis.name == CALIBRATION or hypothesis.size > 1:
+def _search(
+    columns: Columns, noise: Noise, mechanism: Mechanism, share: float,
+    effects: list[MechanismEffect], before: _Found | None,
+) -> _Found:  # fmt: skip
+    """Add what is most worth adding, drop what is not worth having, exchange what is better."""
+    off = possible_errors(mechanism, columns, share)
+    evidence = gather_evidence(columns, noise, off)
+    need = _need(effects)
+    singles = [evidence.fit([one]) for one in effects]
+    first = [e.key for e in before.fitted.effects] if before else []
+    chosen: list[MechanismEffect] = []
+    for key in first:
+        same = [(f.score, e) for e, f in zip(effects, singles, strict=True) if e.key == key]
+        if same:
+            chosen.append(max(same, key=lambda pair: pair[0])[1])
+    now, weak, refused = evidence.fit(chosen), [], set()
+    while len(chosen) < _MOST:
+        left, taken = evidence.beside(now), {one.key for one in chosen} | refused
+        options = [(left.fit([one]).score, k) for k, one in enumerate(effects)
+                   if one.key not in taken]  # fmt: skip
+        if not options or max(options)[0] < need:
+            break
+        one = effects[max(options)[1]]
+        better = evidence.fit([*chosen, one], [*now.values, one.start])
+        if better.score - now.score < need or _slight(one, better.values[-1]):
+            refused.add(one.key)
+            if better.score - now.score >= need:
+                weak.append(better)
             continue
-        force = evidence.force_of(Guess(((hypothesis, deviation),)))
-        factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
-        ratios = 1.0 + values[0]
-        each = ratios
-        if (count := len(columns.runs)) > 1:
-            low, high = np.quantile(runs * last + columns.time, QUANTILES)
-            of_run = (np.linspace(low, high, len(ratios)) // last).astype(int)
-            each = np.array([ratios[of_run == run].mean() for run in range(count) if np.any(of_run == run)])
-        error = np.std(each, ddof=1) / math.sqrt(len(each))
-        is_known = abs(each.mean()) > student_t.ppf(0.975, len(each) - 1) * error
-        if factors[0] > MIN_LOG_BAYES_FACTOR and not is_known:
-            told[hypothesis.key] = _DIFFERS.format(*hypothesis.key, ratios.min(), ratios.max(), factors[0])
-    return told
+        chosen, now = [*chosen, one], better
+        if len(chosen) <= _FEW:
+            chosen, now = _improved(evidence, effects, chosen, now, need, refused)
+    chosen, now = _improved(evidence, effects, chosen, now, need, refused)
+    return _Found(columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused), off)
 
 
-def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Columns) -> _Result:
-    """Patch the MJCF with a model and evaluate it on the held-out run."""
-    mechanism, columns = task.mechanism, evidence.columns
-    patched, now = task.given, then
-    if judged.guess.parts:
+def _need(effects: Sequence[MechanismEffect]) -> float:
+    """Twice the log odds that speak against any one of so many effects before data do."""
+    return 2.0 * np.log(max(len(effects), 1)) + _ODDS
+
+
+def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
+    """Whether an effect is smaller than worth naming."""
+    least = np.array([one.min_relevant_change for one in effect.parameters.values()])
+    nominal = np.array([one.nominal for one in effect.parameters.values()])
+    counted = least > 0.0
+    return float(np.linalg.norm((value - nominal)[counted] / least[counted])) < 1.0
+
+
+def _improved(evidence, effects, chosen, now: Fitted, need: float, refused):
+    """Without what is not needed, and with what explains the same better."""
+    for _ in range(_FEW + len(chosen)):
+        for k in range(len(chosen)):
+            rest = [*chosen[:k], *chosen[k + 1 :]]
+            without = evidence.fit(rest, [*now.values[:k], *now.values[k + 1 :]] if rest else None)
+            if now.score - without.score < need or _slight(chosen[k], now.values[k]):
+                chosen, now = rest, without
+                break
+            keys, left = {one.key for one in rest} | refused, evidence.beside(without)
+            score, place = max((left.fit([one]).score, n) for n, one in enumerate(effects) if one.key not in keys)
+            one = effects[place]
+            if one is chosen[k] or without.score + score < now.score + _BETTER:
+                continue
+            other = evidence.fit([*rest, one], [*without.values, one.start])
+            if other.score > now.score + _BETTER and not _slight(one, other.values[-1]):
+                chosen, now = [*rest, one], other
+                break
+        else:
+            break
+    return chosen, now
+
+
+def _named(found: _Found, shares: Mapping[Key, float]) -> list[NamedEffect]:
+    """Effects with their probabilities against rivals and against none."""
+    out, first = [], 0
+    evidence, now = found.evidence, found.fitted
+    many = np.log(max(len(found.effects), 1))
+    spread = np.sqrt(np.maximum(np.diag(now.covariance), 0.0)) if now.effects else np.zeros(0)
+    for k, effect in enumerate(now.effects):
+        value = now.values[k]
+        own = spread[first : first + len(value)]
+        first += len(value)
+        rest = [*now.effects[:k], *now.effects[k + 1 :]]
+        values = [*now.values[:k], *now.values[k + 1 :]]
+        without = evidence.fit(rest, values if rest else None)
+        left, others = evidence.beside(without), {e.key for e in rest}
+        scores: dict[Key, float] = {}
+        for one in found.effects:
+            if one.key in others or (one is not effect and one.key in found.refused):
+                continue
+            score = now.score if one is effect else without.score + left.fit([one]).score
+            scores[one.key] = float(np.logaddexp(scores.get(one.key, -np.inf), 0.5 * score))
+        none = 0.5 * without.score + many
+        top = max(*scores.values(), none)
+        weights = {key: float(np.exp(s - top)) for key, s in scores.items()}
+        total = sum(weights.values()) + float(np.exp(none - top))
+        rivals = sorted(
+            (Alternative(*key, w / total) for key, w in weights.items()
+             if key != effect.key and w / total >= _WORTH_TELLING),
+            key=lambda a: -a.probability,
+        )  # fmt: skip
         numbers = {
-            name: h.values(d)[name] - p.nominal for h, d in judged.guess.parts if h.name == CALIBRATION
-            for name, p in h.parameters.items()
+            name: Estimate(
+                float(v), p.unit, float(max(v - _NORMAL95 * s, p.lower_bound)),
+                float(min(v + _NORMAL95 * s, p.upper_bound)), p.nominal,
+            )
+            for (name, p), v, s in zip(effect.parameters.items(), value, own, strict=True)
         }  # fmt: skip
-        speeds = {joint: size[2] for joint, size in columns.sizes.items()}
-        patch = patch_of(
-            task.effects_of(judged.guess), mechanism.setup.chain, mechanism.measured_joints, numbers, task.nominal,
-            speeds,
-        )  # fmt: skip
-        patched = replace(
-            task.given, mjcf=patched_mjcf(task.mjcf, patch), mapping=patched_mapping(mechanism.mapping, patch)
-        )
-        with tempfile.TemporaryDirectory() as folder:
-            write_mechanism(Path(folder), patched.mjcf, patched.mapping)
-            better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
-        now = build_columns([task.heldout], better, task.band, patch.errors)
-    heldout = _evidence(task, now, evidence.shape)
-    sizes = []
-    for one, own in ((evidence, judged), (heldout, heldout.judged(Guess()))):
-        sizes.append(_missing(one, own))
-    return _Result(judged, patched, then, now, np.array(sizes))
+        out.append(NamedEffect(
+            effect.name, effect.location, weights[effect.key] / total, numbers, tuple(rivals),
+            shares[effect.key],
+        ))  # fmt: skip
+    return sorted(out, key=lambda e: (-round(e.probability, 3), -e.share))
 
 
-def _missing(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
-    """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
-    rest = evidence.columns.gap - evidence.force_of(judged.guess)
-    found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
-    return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
+def _calibration(mechanism: Mechanism, found: _Found, nominal: Mapping[str, float]):
+    """Calibrated numbers of the model that are told, and the deviations of all; none where it fits.
 
-
-def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float:
-    """RMS error of the patched model on the held-out run over that of the given one."""
-    squares = [
-        np.mean((evidence.shape.weights(one.doubt) * one.gap / evidence.shape.std) ** 2)
-        for one in (result.then, result.now)
-    ]
-    return float(np.sqrt(squares[1] / squares[0]))
-
-
-def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
-    """Effect -> its probability, and those of its alternatives.
-
-    The probability against rivals and none is scaled with that of the fraction of the residual force's variance which
-    the effect explains, on the drive that it moves most.
+    Numbers count as off where the data say so with the effects in the model.
     """
-    out = {}
-    for index, (hypothesis, deviation) in enumerate(found.guess.parts):
-        rest = found.without[index]
-        if hypothesis.name == CALIBRATION or rest is None:
-            continue
-        rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
-        table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
-        moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
-        own = int(np.argmax(moved / evidence.shape.std))
-        now, without = (_missing(evidence, one)[own] ** 2 for one in (found.judged, rest))
-        trust = believed_part(1.0 - now / without if without > now else 0.0)
-        others = tuple(
-            Alternative(*r.hypothesis.key, trust * float(chance))
-            for r, chance in zip(rivals, table[2:], strict=True) if chance >= _MIN_PROBABILITY
-        )  # fmt: skip
-        out[hypothesis.key] = trust * float(table[0]), others
-    return out
-
-
-def _named(
-    task: _Task, evidence: ForceEvidence, result: _Result, chances: Mapping[Key, tuple[float, tuple[Alternative, ...]]]
-) -> tuple[NamedEffect, ...]:  # fmt: skip
-    """Effects of a model with probabilities, intervals, and the fraction of the held-out gap that each closes."""
-    guess, then, now = result.judged.guess, result.then, result.now
-    if not guess.parts:
-        return ()
-    spread = np.sqrt(np.diag(evidence.covariance(result.judged)))
-    rows = min(len(then.time), len(now.time))
-    shape = evidence.shape
-    before, after = (shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now))
-    whole, first, named = float(np.mean(before**2)) - 1.0, 0, []
-    for hypothesis, deviation in guess.parts:
-        std = spread[first : first + hypothesis.size]
-        first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            continue
-        force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
-        added = shape.weights(then.doubt)[:rows] * force / shape.std
-        back = float(np.mean((after + added) ** 2) - np.mean(after**2))
-        share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
-        values, numbers = hypothesis.values(deviation), {}
-        for (name, p), s in zip(hypothesis.parameters.items(), std, strict=True):
-            reach = _NORMAL95 * s * p.prior_std
-            low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
-            numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
-        chance, others = chances[hypothesis.key]
-        named.append(NamedEffect(*hypothesis.key, chance, numbers, others, share))
-    return tuple(sorted(named, key=lambda e: (-round(e.probability, 3), -e.share)))
-
-
-def _calibration(task: _Task, evidence: ForceEvidence, judged: Judged) -> dict[str, Estimate]:
-    """Calibrated parameters that differ from the MJCF."""
-    told, first = {}, 0
-    spread = np.sqrt(np.diag(evidence.covariance(judged))) if judged.guess.parts else np.zeros(0)
-    for hypothesis, deviation in judged.guess.parts:
-        own = spread[first : first + hypothesis.size]
-        first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            for (name, p), d, s in zip(hypothesis.parameters.items(), deviation, own, strict=True):
-                value, reach = p.nominal + d * p.prior_std, _NORMAL95 * s * p.prior_std
-                if abs(d) > _DISTINCT * s:
-                    told[name] = Estimate(value, p.unit, value - reach, value + reach, p.nominal)
-    return told
+    nuisance = {name: std for name, std in found.off.items() if name not in nominal}
+    sharp = gather_evidence(found.columns, found.noise, nuisance)
+    values = list(found.fitted.values) or None
+    as_given = sharp.fit(found.fitted.effects, values)
+    gained = found.evidence.evidence + found.fitted.score - sharp.evidence - as_given.score
+    if gained < _CALIBRATED:
+        return {}, {}
+    deviation, known = found.evidence.calibrated(found.fitted)
+    spread = np.sqrt(np.maximum(np.diag(known), 0.0))
+    numbers = {
+        name: float(d) for name, d in zip(found.evidence.calibrate, deviation, strict=True)
+        if name in nominal
+    }  # fmt: skip
+    told = {}
+    for name, s in zip(found.evidence.calibrate, spread, strict=True):
+        if name in numbers and abs(numbers[name]) > _TOLD * s:
+            value = nominal[name] + numbers[name]
+            told[name] = Estimate(
+                value, parameter_unit(mechanism, name), value - _NORMAL95 * float(s),
+                value + _NORMAL95 * float(s), nominal[name],
+            )  # fmt: skip
+    return told, numbers
 
 
 def parameter_unit(mechanism: Mechanism, name: str) -> str:
@@ -534,8 +517,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
     kind, _, place = name.partition(".")
     if kind in BODY_PARAMETERS:
         return BODY_PARAMETERS[kind]
-    chain = mechanism.setup.chain
-    force = "N" if place in chain.joints and chain.tree.is_slide[chain.index(place)] else "N m"
+    force = _unit(mechanism, place)
     length = "m" if force == "N" else "rad"
     return {
         "viscous": f"{force} s/{length}", "viscous_asymmetry": f"{force} s/{length}",
@@ -544,95 +526,182 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
     }.get(kind, force)  # fmt: skip
 
 
-def _channels(task: _Task) -> tuple[str, ...]:
-    return tuple(f"{'force' if task.unit(d) == 'N' else 'torque'}.{d}" for d in task.drives)
+def _unit(mechanism: Mechanism, joint: str) -> str:
+    chain = mechanism.setup.chain
+    straight = joint in chain.joints and chain.tree.is_slide[chain.index(joint)]
+    return "N" if straight else "N m"
 
 
-def _predictions(
-    task: _Task, evidence: ForceEvidence, shape: NoiseShape, result: _Result, rows: slice, patched: bool
-) -> tuple[Prediction, ...]:
-    """Predictions of the given or the patched model, the held-out run first."""
-    channels, then, fit = _channels(task), result.then, evidence.columns
-    error, doubt = (result.now.gap, result.now.doubt) if patched else (then.gap, then.doubt)
-    rest = fit.gap - evidence.force_of(result.judged.guess) if patched else fit.gap
+class _Judged(NamedTuple):
+    """What the held-out run says.
 
-    def prediction(run: str, time: np.ndarray, measured, error, doubt) -> Prediction:
-        return Prediction(run, time, channels, measured - error, measured, shape.weights(doubt) * error / shape.std)
+    Attributes:
+        std: (k,) noise of the drives' forces, without what is lacking [N] or [N m].
+        left: what the patched model lacks.
+        shares: effect -> share of the gap that comes back without it.
+        spoiling: effects without which, all else fitted again, the held-out run's squared errors,
+            whitened by the noise, are smaller, and by more than noise explains if these effects are
+            there -> by how much the errors grow without them.
+        moved: effect -> (k,) RMS of what it does to every drive's force [N] or [N m].
+        before: predictions of the given model, the held-out run first.
+        after: of the patched one.
+    """
 
-    out = [prediction(then.runs[0], then.time[rows], then.measured[rows], error[rows], doubt[rows])]
-    for run, a, b in zip(fit.runs, fit.starts[:-1], fit.starts[1:], strict=True):
-        out.append(prediction(run, fit.time[a:b], fit.measured[a:b], rest[a:b], fit.doubt[a:b]))
-    return tuple(out)
+    std: np.ndarray
+    left: Left
+    shares: Mapping[Key, float]
+    spoiling: Mapping[Key, float]
+    moved: Mapping[Key, np.ndarray]
+    before: tuple[Prediction, ...]
+    after: tuple[Prediction, ...]
 
 
-def _lacks(task: _Task, result: _Result) -> tuple[Lack, ...]:
-    """Residual forces that remain, the largest first."""
-    share, sizes = result.share().max(axis=0), result.sizes.max(axis=0)
+def _judged(
+    mechanism: Mechanism, found: _Found, nominal: Mapping[str, float], then: Columns, now: Columns
+) -> _Judged:  # fmt: skip
+    fit, noise = found.columns, found.noise
+    rest = _unexplained(found)
+    weight = row_weights(noise.doubtful, then.doubt)
+    rows = min(len(then.time), len(now.time))  # a late sensor tells nothing of the last ones
+    later = row_weights(noise.doubtful, now.doubt)
+    spread = np.sqrt(found.evidence.predicted_variance(found.fitted, then.matrix).mean(axis=0))
+    left = find_left(
+        fit, now, rest, now.gap, noise.std, noise.weight * (fit.doubt < _TURNS),
+        later * (now.doubt < _TURNS), spread,
+    )  # fmt: skip
+    std = noise.std * np.sqrt(np.where(left.lacking, np.clip(1.0 - left.share, 0.05, 1.0), 1.0))
+    plain = {(e.key, e.variant): e for e in
+             mechanism_effects(mechanism.setup.chain, then, nominal, {})}  # fmt: skip
+    places = {name: k for k, name in enumerate(then.names)}
+    before = (weight * then.gap / std)[:rows]
+    after = (later * now.gap / std)[:rows]
+    whole = float(np.mean(before**2)) - 1.0
+
+    def squares(error: np.ndarray) -> float:
+        return float(np.sum(whitened(error, replace(noise, weight=later[:rows]), (0, rows)) ** 2))
+
+    shares, moved, spoiling, value_of_all = {}, {}, {}, found.coefficients()
+    for effect, value in zip(found.fitted.effects, found.fitted.values, strict=True):
+        own = plain.get((effect.key, effect.variant))
+        if own is None:
+            shares[effect.key], moved[effect.key] = 0.0, np.zeros(len(std))
+            continue
+        at = [places[name] for name in own.columns]
+        added = then.matrix[:rows, :, at] @ own.coefficients(value)
+        back = float(np.mean((after + weight[:rows] * added / std) ** 2) - np.mean(after**2))
+        shares[effect.key] = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+        moved[effect.key] = np.sqrt(np.mean(added**2, axis=0))
+        change = value_of_all - _without(found, [effect.key]).coefficients()
+        error, change = now.gap[:rows], then.matrix[:rows] @ change
+        expected = squares(change)
+        gain = squares(error + change) - squares(error)
+        if gain < min(0.0, expected + 2.0 * _SPOILT * np.sqrt(expected)):
+            spoiling[effect.key] = gain
+    channels = tuple(f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}" for d in mechanism.setup.chain.drives)
+
+    def prediction(run: str, time: np.ndarray, measured, error, whitened) -> Prediction:
+        return Prediction(run, time, channels, measured - error, measured, whitened)
+
+    logged = then.measured[:rows]
+    predictions = [
+        [prediction(then.runs[0], then.time[:rows], logged, then.gap[:rows], before)],
+        [prediction(then.runs[0], then.time[:rows], logged, now.gap[:rows], after)],
+    ]
+    for run, first, last in zip(fit.runs, fit.starts[:-1], fit.starts[1:], strict=True):
+        some = slice(first, last)
+        for which, error in zip(predictions, (fit.gap, rest), strict=True):
+            which.append(prediction(
+                run, fit.time[some], fit.measured[some], error[some],
+                (noise.weight * error / std)[some],
+            ))  # fmt: skip
+    return _Judged(std, left, shares, spoiling, moved, tuple(predictions[0]), tuple(predictions[1]))
+
+
+def _unexplained(found: _Found) -> np.ndarray:
+    """(n, k) of the fitted runs, after effects and calibrated numbers [N] or [N m]."""
+    return found.columns.gap - found.columns.matrix @ found.coefficients()
+
+
+def _believable(named: Sequence[NamedEffect], judged: _Judged):
+    """Effects, and those that may only make up for what is lacking on the drive they move most."""
+    places = {effect.location.partition(".")[0] for effect in named}
+    named, small = without_details(named, bool(judged.left.lacking.any()), places)
+    kept, details = [], list(small)
+    for effect in named:
+        moved = judged.moved[effect.name, effect.location]
+        own = int(np.argmax(moved / judged.std))
+        hidden = judged.left.lacking[own] and judged.left.size[own] > moved[own]
+        (details if hidden else kept).append(effect)
+    return tuple(kept), tuple(details)
+
+
+def _rms(prediction: Prediction) -> float:
+    return float(np.sqrt(np.nanmean(prediction.whitened**2)))
+
+
+def _channel_rms(prediction: Prediction) -> np.ndarray:
+    return np.sqrt(np.nanmean(prediction.whitened**2, axis=0))
+
+
+def _lacks(mechanism: Mechanism, left: Left, judge: Columns) -> tuple[Lack, ...]:
+    """Forces that remain, the largest first."""
+    most = np.abs(judge.measured).max(axis=0)
     found = [
-        Lack("force", drive, float(sizes[k]), task.unit(drive), float(share[k]))
-        for k, drive in enumerate(task.drives) if share[k] > MIN_FORCE_SHARE
+        Lack("force", drive, float(left.size[k]), _unit(mechanism, drive),
+             float(left.size[k] / max(most[k], 1e-12)))
+        for k, drive in enumerate(mechanism.setup.chain.drives) if left.lacking[k]
     ]  # fmt: skip
     return tuple(sorted(found, key=lambda lack: -lack.part))
 
 
-def _tests(result: _Result) -> dict[str, dict]:
-    """Tests of the residual forces, in fractions of the drives' forces."""
-    share = result.share().max(axis=1)
-    return {
-        name: {"value": float(value), "limit": MIN_FORCE_SHARE, "passed": bool(value <= MIN_FORCE_SHARE)}
-        for name, value in zip(("residual_force", "heldout_residual_force"), share, strict=True)
-    }
+def _unknown(left: Left, lacks: Sequence[Lack], after: Prediction) -> Unknown:
+    """Describe what no effect explains: where, on what it depends, when."""
+    drives = [channel.partition(".")[2] for channel in after.channels]
+    worst = drives.index(lacks[0].axis)
+    words = [lack_words(lack) for lack in lacks[:3]]
+    own = [law for law in left.laws if law.drive == worst]
+    depends = tuple(dict.fromkeys(name for law in own for name in law.variables))
+    if own:
+        told = " and ".join(channel_words(name) for name in depends)
+        words.append(
+            f"{100 * float(left.share[worst]):.0f} % of the remaining force on {drives[worst]} depend on {told}."
+        )
+    else:
+        words.append(
+            f"The remaining force on {drives[worst]} does not depend on positions or velocities"
+            " alone: check the time windows in which it occurs."
+        )
+    return Unknown(
+        "force", after.channels[worst], depends, " ".join(words), None,
+        loud_windows(after.time, after.whitened[:, worst]),
+    )  # fmt: skip
 
 
-def _dependence(evidence: ForceEvidence, result: _Result) -> tuple[str, ...]:
-    """Variables of a function that explains the largest residual force of the fitted runs best; none if none does."""
-    columns = evidence.columns
-    worst = int(np.argmax(result.share().max(axis=0)))
-    force = np.zeros(columns.gap.shape)
-    force[:, worst] = TYPICAL * np.sqrt(np.mean(columns.measured[:, worst] ** 2))
-    names = list(columns.states)
-    for many in (1, 2):
-        chosen = list(combinations(names, many))
-        series = [[columns.states[name] for name in some] for some in chosen]
-        factors, _ = evidence.compare_laws(result.judged, force, series)
-        if factors.max() > MIN_LOG_BAYES_FACTOR:
-            return chosen[int(np.argmax(factors))]
-    return ()
-
-
-def _ranking(found: Found) -> tuple[Candidate, ...]:
+def _ranking(found: _Found) -> tuple[Candidate, ...]:
+    best: dict[Key, Fitted] = {}
+    for effect, one in zip(found.effects, found.singles, strict=True):
+        if effect.key not in best or one.score > best[effect.key].score:
+            best[effect.key] = one
+    order = sorted(best.values(), key=lambda one: -one.score)
     return tuple(
         Candidate(
-            *s.hypothesis.key, s.gain, s.gain - s.score, s.hypothesis.values(s.start),
-            {name: p.unit for name, p in s.hypothesis.parameters.items()},
+            one.effects[0].name, one.effects[0].location, one.gain, one.gain - one.score,
+            dict(zip(one.effects[0].parameters, map(float, one.values[0]), strict=True)),
+            {name: p.unit for name, p in one.effects[0].parameters.items()},
         )
-        for s in found.ranking[:15]
+        for one in order[:15]
     )  # fmt: skip
 
 
-def _rejections(
-    found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], untrue: Sequence[str]
-) -> tuple[Rejection, ...]:
-    """What was tried and not named, with the test that it failed."""
-    out = [Rejection(e.name, e.location, "fraction of the gap closed", e.share, MIN_FORCE_SHARE) for e in details]
-    if not found.guess.parts:
-        out += [
-            Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)
-            for s in found.ranking[:3] if s.score < MIN_LOG_BAYES_FACTOR
-        ]  # fmt: skip
-    return (*out, *(Rejection("", "", sentence, np.nan, np.nan) for sentence in untrue))
-
-
-def _traces(task: _Task, evidence: ForceEvidence, result: _Result) -> tuple[InputTrace, ...]:
-    """Force errors of the drive whose error is largest, over the first fitted run, with what the model adds."""
-    columns = evidence.columns
-    rows = slice(columns.starts[0], columns.starts[1])
-    added = evidence.force_of(result.judged.guess)[rows]
-    order = np.argsort(-np.sqrt(np.mean(columns.gap**2, axis=0)) / evidence.shape.std)
-    return tuple(
-        InputTrace(
-            columns.runs[0], "force", task.drives[k], task.unit(task.drives[k]), columns.time[rows],
-            columns.gap[rows, k], columns.gap[rows, k] - added[:, k], added[:, k],
+def _notes(found: _Found, band: float) -> list[str]:
+    notes = [f"Forces are compared below {band:.3g} Hz."]
+    for one in found.weak:
+        effect = one.effects[-1]
+        told = ", ".join(
+            f"{name} {value:.4g} {p.unit}"
+            for (name, p), value in zip(effect.parameters.items(), one.values[-1], strict=True)
         )
-        for k in order[:4]
-    )  # fmt: skip
+        notes.append(
+            f"{effect.name} at {effect.location}, {told}, is too small to be named and was not added to the model."
+        )
+    return notes

@@ -209,9 +209,7 @@ def add_effects(
         share = 0.05 + 0.8 * index / model.max_effects
         tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals, varying = propose(
-            model, now, [c for c in pool if not is_pulse(c)], quantities, effects, has_laws
-        )
+        proposals, varying = propose(model, now, [c for c in pool if not is_pulse(c)], quantities, effects, has_laws)
         proposals = sorted([*proposals, *propose_disturbances(model, now, candidates)], key=lambda p: -p.factor)
         first = first or tuple(proposals)
         kept = [p.key for p in proposals if not p.law][:_KEPT]

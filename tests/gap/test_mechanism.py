@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.gap.force_evidence import estimate_noise
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
+from hydrotele.gap.mechanism_evidence import find_noise
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.patched import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
@@ -149,7 +149,7 @@ def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path):
     mechanism = load_mechanism(tmp_path / "robot.xml")
     fit, _, _ = load_mechanism_records([tmp_path / "logs"], mechanism, keep_measured_joints=True)
     columns = build_columns(fit, mechanism, common_band(fit, mechanism))
-    assert estimate_noise(columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
+    assert find_noise(columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
 
 
 def test_a_tilt_of_the_base_turns_gravity():

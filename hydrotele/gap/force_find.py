@@ -1,0 +1,597 @@
+"""The gap of a mechanism without hydraulics: from measured motion and forces to a Gap.
+
+The search is that of any machine (`gap.model_search`), on inverse dynamics (`gap.force_evidence`). What it names is
+written into the MJCF and its mapping, and that patched model is judged on a run that was not fitted.
+"""
+
+import math
+import tempfile
+import time
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import t as student_t
+from threadpoolctl import threadpool_limits
+
+from hydrotele.core.errors import InputError
+from hydrotele.core.mjcf import read_mjcf
+from hydrotele.effects.effect import Parameter
+from hydrotele.estimate.evidence import Judged
+from hydrotele.estimate.hypothesis import CALIBRATION, Guess
+from hydrotele.gap.answer import answer_document, answer_words
+from hydrotele.gap.description import describe
+from hydrotele.gap.explanation import compare_contenders
+from hydrotele.gap.find import Progress, verdict_of, without_details
+from hydrotele.gap.force_columns import ForceEffect, force_effects
+from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, calibration_of, estimate_noise
+from hydrotele.gap.mechanism_columns import (
+    SENTENCES,
+    TYPICAL,
+    Columns,
+    Key,
+    build_columns,
+    common_band,
+    undone,
+)
+from hydrotele.gap.mechanism_find import MechanismModel, nominal_parameters
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
+from hydrotele.gap.patched import (
+    COLUMNS_FILE,
+    MJCF_FILE,
+    patch_of,
+    patched_mapping,
+    patched_mjcf,
+    sensor_errors,
+    write_mechanism,
+)
+from hydrotele.gap.residuals import believed_part
+from hydrotele.gap.result import (
+    LIKELY,
+    Alternative,
+    Candidate,
+    Estimate,
+    Gap,
+    GapSize,
+    InputTrace,
+    Lack,
+    NamedEffect,
+    Prediction,
+    Rejection,
+    VerdictExplanation,
+)
+from hydrotele.gap.rivals import effect_probabilities
+from hydrotele.gap.search import Found
+from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.multibody.regressor import BODY_PARAMETERS
+
+MIN_FORCE_SHARE = 0.02
+"""Fraction of the RMS force of a drive below which a residual force is no gap: models of friction are no better."""
+_MAX_ROUNDS = 4  # of taking sensor errors off the readings and searching again
+_UNCHANGED = 0.01  # prior standard deviations; a smaller change of the sensor errors ends these rounds
+_FORM = 0.1  # of a drive's dry friction, by which its form near rest may differ: presliding is not in the model
+_SHARPNESS = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
+_WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
+_MIN_PROBABILITY = 0.005  # below which an alternative is not listed
+_DISTINCT = 3.0  # standard deviations from which a calibrated parameter is listed
+_NORMAL95 = 1.96
+_REJECTED = (
+    "The changes found on the fitted runs increase the errors on the held-out run; they were"
+    " rejected, and no effect is named."
+)
+_DIFFERS = (
+    "{} at {}, found on the fitted runs, differs between parts of these runs ({:.2g} to {:.2g} times the fitted value,"
+    " twice the log Bayes factor against a constant value {:.0f}); it was rejected."
+)
+_HELD_OUT_ONLY = "A force of {:.3g} {} RMS acts on {} in the held-out run {} alone; the fitted runs do not show it."
+METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
+
+
+class _Task(NamedTuple):
+    """The given model and the runs."""
+
+    mjcf: str | Path
+    mechanism: Mechanism
+    given: MechanismModel
+    nominal: Mapping[str, float]
+    fit: Sequence[IdentificationRecord]
+    heldout: IdentificationRecord
+    band: float
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        return tuple(self.mechanism.setup.chain.drives)
+
+    def unit(self, joint: str) -> str:
+        chain = self.mechanism.setup.chain
+        return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
+
+    def effects_of(self, guess: Guess) -> list[tuple[ForceEffect, np.ndarray]]:
+        """Effects of a guess with their parameter values, without the calibration."""
+        return [(h, np.array(list(h.values(d).values()))) for h, d in guess.parts
+                if h.name != CALIBRATION and isinstance(h, ForceEffect)]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Result:
+    """A model, fitted, and what the held-out run says of it.
+
+    Attributes:
+        guess: the model.
+        judged: on the fitted runs.
+        patched: the MJCF with it.
+        then: held-out columns of the given model.
+        now: of the patched one.
+        sizes: (2, k) residual forces of the fitted runs and of the held-out run [N] or [N m]; 0 where no evidence.
+    """
+
+    judged: Judged
+    patched: MechanismModel
+    then: Columns
+    now: Columns
+    sizes: np.ndarray
+
+    def share(self) -> np.ndarray:
+        """(2, k) residual forces over the RMS of the drives' forces."""
+        return self.sizes / np.sqrt(np.mean(self.then.measured**2, axis=0))
+
+    @property
+    def lacking(self) -> np.ndarray:
+        """(2, k) whether a force is missing in the fitted runs, and in the held-out run."""
+        return self.share() > MIN_FORCE_SHARE
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # results may not depend on the number of threads
+def find_force_gap(
+    mjcf: str | Path, mapping: str | Path | ColumnMapping | None,
+    fit: Sequence[IdentificationRecord], heldout: IdentificationRecord,
+    progress: Progress | None = None, effects: Sequence[str] = (), notes: Sequence[str] = (),
+) -> Gap[MechanismModel]:  # fmt: skip
+    """Find where the model of a mechanism and its logs disagree.
+
+    Args:
+        mjcf: file of the given model.
+        mapping: of its columns, or its file.
+        fit: records of the runs that decide, in the measured joints.
+        heldout: the run that judges.
+        progress: called with (what is being done, share done).
+        effects: names of the effects to try; all if empty.
+        notes: to hand on.
+
+    Returns:
+        The gap, named or not.
+
+    Raises:
+        InputError: an effect is not known, or the runs cannot be followed.
+    """
+    begin = time.perf_counter()
+    tell = progress or (lambda text, share: None)
+    if strange := [name for name in effects if name not in SENTENCES]:
+        raise InputError(
+            f"--effect {strange[0]}",
+            f"is not an effect of mechanisms; valid: {', '.join(sorted(SENTENCES))}",
+        )
+    mechanism = load_mechanism(mjcf, mapping)
+    given = MechanismModel(mechanism.setup.chain.name, read_mjcf(mjcf).flatten(), mechanism.mapping)
+    nominal = nominal_parameters(mechanism)
+    task = _Task(mjcf, mechanism, given, nominal, fit, heldout, common_band(fit, mechanism))
+    evidence, found = _search(task, effects, tell)
+    tell("evaluate the patched model on the held-out run", 0.9)
+    chances = _probabilities(evidence, found)
+    small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
+             for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
+    judged, untrue = _without(evidence, found.judged, small), list(small.values())
+    varying: dict[Key, str] = {}
+    while varying := _varying(evidence, judged):
+        untrue += varying.values()
+        judged = _without(evidence, judged, varying)
+    details: tuple[NamedEffect, ...] = ()
+    then = build_columns([heldout], mechanism, task.band)
+    result = _evaluate(task, evidence, judged, then)
+    while True:
+        if not _error_ratio(task, evidence, result) <= _WORSE:
+            untrue.append(_REJECTED)
+            evidence, found = _unfitted(task)
+            result = _evaluate(task, evidence, found.judged, then)
+        named = _named(task, evidence, result, chances)
+        named, more = without_details(named, bool(result.lacking.any()), task.drives)
+        unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
+        named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
+        details += more
+        if not more:
+            break
+        judged = _without(evidence, result.judged, {(e.name, e.location) for e in more})
+        result = _evaluate(task, evidence, judged, then)
+    shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
+    before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
+    lacks = _lacks(task, result)
+    unknown = None
+    if lacks:
+        unknown = describe(lacks, (), after)
+        depends = _dependence(evidence, result)
+        unknown = replace(unknown, depends_on=depends, channel=_channels(task)[task.drives.index(lacks[0].axis)])
+    rms = [np.sqrt(np.nanmean(one[0].whitened ** 2, axis=0)) for one in (before, after)]
+    total = [float(np.sqrt(np.mean(one**2))) for one in rms]
+    more = [
+        f"Forces are compared below {task.band:.3g} Hz.",
+        *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
+    ]
+    more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
+             for k, drive in enumerate(task.drives) if result.lacking[1, k] and not result.lacking[0, k]]  # fmt: skip
+    more += [words for effect in named if (words := answer_words(effect))]
+    tell("done", 1.0)
+    return Gap(
+        machine=given, patched=result.patched, verdict=verdict_of(named, bool(result.lacking.any()), 1.0),
+        effects=named, unknown=unknown, size=GapSize(total[0], total[1], 1.0, METRIC), ranking=_ranking(found),
+        before=before, after=after,
+        laws={"force": {
+            drive: {"before": float(a * std), "after": float(b * std), "noise": float(std)}
+            for drive, a, b, std in zip(task.drives, *rms, shape.std, strict=True)
+        }},
+        law_units={"force": task.unit(task.drives[0])}, tests=_tests(result),
+        calibration=_calibration(task, evidence, result.judged), lacks=lacks,
+        noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
+        notes=(*notes, *untrue, *more), answers=tuple(answer_document(named)),
+        explanation=VerdictExplanation(
+            compare_contenders(found, named), _rejections(found, named, details, untrue),
+            _traces(task, evidence, result),
+        ),
+        seconds=time.perf_counter() - begin,
+    )  # fmt: skip
+
+
+def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> ForceEffect:
+    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping, as one group.
+
+    Args:
+        mechanism: the model.
+        nominal: of `nominal_parameters`.
+
+    Returns:
+        The group. Moments and products of inertia are uncertain relative to the body's mass and size.
+    """
+    off, chain, std = mechanism.mapping.relative_uncertainty, mechanism.setup.chain, {}
+    for body, ten in zip(chain.bodies, chain.inertia, strict=True):
+        mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
+        reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
+        for kind in BODY_PARAMETERS:
+            std[f"{kind}.{body}"] = mass if kind == "mass" else reach if kind.startswith("moment") else spread
+    table = {}
+    for name, value in nominal.items():
+        width = off * std.get(name, abs(value))
+        if width > 0.0:
+            table[name] = Parameter(parameter_unit(mechanism, name), value, -np.inf, np.inf, width, 0.0)
+    return calibration_of(table)
+
+
+def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
+    """Return what no model knows: column -> standard deviation.
+
+    How dry friction acts near rest, and how sharply it turns.
+    """
+    form: dict[str, float] = {}
+    for one in mechanism.setup.friction_terms:
+        dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
+        if one.location in columns.drives and dry > 0.0:
+            form |= {f"stribeck{number}.{one.location}": _FORM * dry for number in (0, 2)}
+            form[f"sharpness.{one.location}"] = _SHARPNESS * dry
+    return form
+
+
+def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvidence, Found]:
+    """Search; take sensor errors off the readings and search again until nothing changes."""
+    applied: dict[Key, np.ndarray] = {}
+    known: Sequence[tuple[ForceEffect, np.ndarray]] = ()
+    chain, joints, about = task.mechanism.setup.chain, task.mechanism.measured_joints, {}
+    for turn in range(_MAX_ROUNDS):
+        begin = 0.9 * turn / _MAX_ROUNDS
+        tell(f"compute the regressors of all effects, round {turn + 1}", begin)
+        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(known, chain, joints), about)
+        columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
+        effects = force_effects(chain, columns, task.nominal, applied)
+        effects = [one for one in effects if not names or one.name in names]
+        evidence = _evidence(task, columns)
+        found = search_model(
+            evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
+        )
+        known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
+        value = evidence.coefficients(found.guess)
+        about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
+        steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
+                 / [p.prior_std for p in h.parameters.values()] for h, v in known]  # fmt: skip
+        if {h.key for h, _ in known} == set(applied) and all(np.all(step < _UNCHANGED) for step in steps):
+            break
+        applied = {h.key: v for h, v in known}
+    return evidence, found
+
+
+def _evidence(task: _Task, columns: Columns, shape: NoiseShape | None = None) -> ForceEvidence:
+    return ForceEvidence(
+        columns, shape or estimate_noise(columns), uncertain_parameters(task.mechanism, task.nominal),
+        uncertain_form(task.mechanism, columns),
+    )  # fmt: skip
+
+
+def _unfitted(task: _Task) -> tuple[ForceEvidence, Found]:
+    """Evidence on the readings as they are, and a search that found nothing."""
+    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band))
+    judged = evidence.judged(Guess())
+    return evidence, Found(judged, judged, None, (), (), (), (), None)
+
+
+def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
+    """Return whether an effect is smaller than its smallest relevant change in all parameters together."""
+    facts = [p for p in effect.parameters.values() if p.min_relevant_change > 0.0]
+    change = [(v - p.nominal) / p.min_relevant_change
+              for v, p in zip(values, effect.parameters.values(), strict=True) if p in facts]  # fmt: skip
+    return float(np.linalg.norm(change)) < 1.0
+
+
+def _not_named(key: Key, values: Mapping[str, float]) -> str:
+    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+    return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
+
+
+def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
+    """Fit a model again without some effects."""
+    if not dropped:
+        return judged
+    parts = tuple(part for part in judged.guess.parts if part[0].key not in dropped)
+    rest = evidence.judged(Guess(parts))
+    return evidence.settle(rest)[0] if parts else rest
+
+
+def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
+    """Return effects with one parameter whose mean over the runs is not known, because they differ -> a sentence.
+
+    They are rejected if the 95 % interval of the mean, by Student's distribution, holds 0. Of a single run, its parts
+    take the place of the runs.
+    """
+    told: dict[Key, str] = {}
+    columns = evidence.columns
+    runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
+    last = columns.time.max()
+    for hypothesis, deviation in judged.guess.parts:
+        if hypothesis.name == CALIBRATION or hypothesis.size > 1:
+            continue
+        force = evidence.force_of(Guess(((hypothesis, deviation),)))
+        factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
+        ratios = 1.0 + values[0]
+        each = ratios
+        if (count := len(columns.runs)) > 1:
+            low, high = np.quantile(runs * last + columns.time, QUANTILES)
+            of_run = (np.linspace(low, high, len(ratios)) // last).astype(int)
+            each = np.array([ratios[of_run == run].mean() for run in range(count) if np.any(of_run == run)])
+        error = np.std(each, ddof=1) / math.sqrt(len(each))
+        is_known = abs(each.mean()) > student_t.ppf(0.975, len(each) - 1) * error
+        if factors[0] > MIN_LOG_BAYES_FACTOR and not is_known:
+            told[hypothesis.key] = _DIFFERS.format(*hypothesis.key, ratios.min(), ratios.max(), factors[0])
+    return told
+
+
+def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Columns) -> _Result:
+    """Patch the MJCF with a model and evaluate it on the held-out run."""
+    mechanism, columns = task.mechanism, evidence.columns
+    patched, now = task.given, then
+    if judged.guess.parts:
+        numbers = {
+            name: h.values(d)[name] - p.nominal for h, d in judged.guess.parts if h.name == CALIBRATION
+            for name, p in h.parameters.items()
+        }  # fmt: skip
+        speeds = {joint: size[2] for joint, size in columns.sizes.items()}
+        patch = patch_of(
+            task.effects_of(judged.guess), mechanism.setup.chain, mechanism.measured_joints, numbers, task.nominal,
+            speeds,
+        )  # fmt: skip
+        patched = replace(
+            task.given, mjcf=patched_mjcf(task.mjcf, patch), mapping=patched_mapping(mechanism.mapping, patch)
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            write_mechanism(Path(folder), patched.mjcf, patched.mapping)
+            better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
+        now = build_columns([task.heldout], better, task.band, patch.errors)
+    heldout = _evidence(task, now, evidence.shape)
+    sizes = []
+    for one, own in ((evidence, judged), (heldout, heldout.judged(Guess()))):
+        sizes.append(_missing(one, own))
+    return _Result(judged, patched, then, now, np.array(sizes))
+
+
+def _missing(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
+    """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
+    rest = evidence.columns.gap - evidence.force_of(judged.guess)
+    found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
+    return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
+
+
+def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float:
+    """RMS error of the patched model on the held-out run over that of the given one."""
+    squares = [
+        np.mean((evidence.shape.weights(one.doubt) * one.gap / evidence.shape.std) ** 2)
+        for one in (result.then, result.now)
+    ]
+    return float(np.sqrt(squares[1] / squares[0]))
+
+
+def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
+    """Effect -> its probability, and those of its alternatives.
+
+    The probability against rivals and none is scaled with that of the fraction of the residual force's variance which
+    the effect explains, on the drive that it moves most.
+    """
+    out = {}
+    for index, (hypothesis, deviation) in enumerate(found.guess.parts):
+        rest = found.without[index]
+        if hypothesis.name == CALIBRATION or rest is None:
+            continue
+        rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
+        table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
+        moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
+        own = int(np.argmax(moved / evidence.shape.std))
+        now, without = (_missing(evidence, one)[own] ** 2 for one in (found.judged, rest))
+        trust = believed_part(1.0 - now / without if without > now else 0.0)
+        others = tuple(
+            Alternative(*r.hypothesis.key, trust * float(chance))
+            for r, chance in zip(rivals, table[2:], strict=True) if chance >= _MIN_PROBABILITY
+        )  # fmt: skip
+        out[hypothesis.key] = trust * float(table[0]), others
+    return out
+
+
+def _named(
+    task: _Task, evidence: ForceEvidence, result: _Result, chances: Mapping[Key, tuple[float, tuple[Alternative, ...]]]
+) -> tuple[NamedEffect, ...]:  # fmt: skip
+    """Effects of a model with probabilities, intervals, and the fraction of the held-out gap that each closes."""
+    guess, then, now = result.judged.guess, result.then, result.now
+    if not guess.parts:
+        return ()
+    spread = np.sqrt(np.diag(evidence.covariance(result.judged)))
+    rows = min(len(then.time), len(now.time))
+    shape = evidence.shape
+    before, after = (shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now))
+    whole, first, named = float(np.mean(before**2)) - 1.0, 0, []
+    for hypothesis, deviation in guess.parts:
+        std = spread[first : first + hypothesis.size]
+        first += hypothesis.size
+        if hypothesis.name == CALIBRATION:
+            continue
+        force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
+        added = shape.weights(then.doubt)[:rows] * force / shape.std
+        back = float(np.mean((after + added) ** 2) - np.mean(after**2))
+        share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
+        values, numbers = hypothesis.values(deviation), {}
+        for (name, p), s in zip(hypothesis.parameters.items(), std, strict=True):
+            reach = _NORMAL95 * s * p.prior_std
+            low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
+            numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
+        chance, others = chances[hypothesis.key]
+        named.append(NamedEffect(*hypothesis.key, chance, numbers, others, share))
+    return tuple(sorted(named, key=lambda e: (-round(e.probability, 3), -e.share)))
+
+
+def _calibration(task: _Task, evidence: ForceEvidence, judged: Judged) -> dict[str, Estimate]:
+    """Calibrated parameters that differ from the MJCF."""
+    told, first = {}, 0
+    spread = np.sqrt(np.diag(evidence.covariance(judged))) if judged.guess.parts else np.zeros(0)
+    for hypothesis, deviation in judged.guess.parts:
+        own = spread[first : first + hypothesis.size]
+        first += hypothesis.size
+        if hypothesis.name == CALIBRATION:
+            for (name, p), d, s in zip(hypothesis.parameters.items(), deviation, own, strict=True):
+                value, reach = p.nominal + d * p.prior_std, _NORMAL95 * s * p.prior_std
+                if abs(d) > _DISTINCT * s:
+                    told[name] = Estimate(value, p.unit, value - reach, value + reach, p.nominal)
+    return told
+
+
+def parameter_unit(mechanism: Mechanism, name: str) -> str:
+    """SI unit of a regressor's parameter, such as `mass.link` or `viscous.joint`."""
+    kind, _, place = name.partition(".")
+    if kind in BODY_PARAMETERS:
+        return BODY_PARAMETERS[kind]
+    chain = mechanism.setup.chain
+    force = "N" if place in chain.joints and chain.tree.is_slide[chain.index(place)] else "N m"
+    length = "m" if force == "N" else "rad"
+    return {
+        "viscous": f"{force} s/{length}", "viscous_asymmetry": f"{force} s/{length}",
+        "quadratic": f"{force} s^2/{length}^2",
+        "drive_inertia": "kg" if force == "N" else "kg m^2",
+    }.get(kind, force)  # fmt: skip
+
+
+def _channels(task: _Task) -> tuple[str, ...]:
+    return tuple(f"{'force' if task.unit(d) == 'N' else 'torque'}.{d}" for d in task.drives)
+
+
+def _predictions(
+    task: _Task, evidence: ForceEvidence, shape: NoiseShape, result: _Result, rows: slice, patched: bool
+) -> tuple[Prediction, ...]:
+    """Predictions of the given or the patched model, the held-out run first."""
+    channels, then, fit = _channels(task), result.then, evidence.columns
+    error, doubt = (result.now.gap, result.now.doubt) if patched else (then.gap, then.doubt)
+    rest = fit.gap - evidence.force_of(result.judged.guess) if patched else fit.gap
+
+    def prediction(run: str, time: np.ndarray, measured, error, doubt) -> Prediction:
+        return Prediction(run, time, channels, measured - error, measured, shape.weights(doubt) * error / shape.std)
+
+    out = [prediction(then.runs[0], then.time[rows], then.measured[rows], error[rows], doubt[rows])]
+    for run, a, b in zip(fit.runs, fit.starts[:-1], fit.starts[1:], strict=True):
+        out.append(prediction(run, fit.time[a:b], fit.measured[a:b], rest[a:b], fit.doubt[a:b]))
+    return tuple(out)
+
+
+def _lacks(task: _Task, result: _Result) -> tuple[Lack, ...]:
+    """Residual forces that remain, the largest first."""
+    share, sizes = result.share().max(axis=0), result.sizes.max(axis=0)
+    found = [
+        Lack("force", drive, float(sizes[k]), task.unit(drive), float(share[k]))
+        for k, drive in enumerate(task.drives) if share[k] > MIN_FORCE_SHARE
+    ]  # fmt: skip
+    return tuple(sorted(found, key=lambda lack: -lack.part))
+
+
+def _tests(result: _Result) -> dict[str, dict]:
+    """Tests of the residual forces, in fractions of the drives' forces."""
+    share = result.share().max(axis=1)
+    return {
+        name: {"value": float(value), "limit": MIN_FORCE_SHARE, "passed": bool(value <= MIN_FORCE_SHARE)}
+        for name, value in zip(("residual_force", "heldout_residual_force"), share, strict=True)
+    }
+
+
+def _dependence(evidence: ForceEvidence, result: _Result) -> tuple[str, ...]:
+    """Variables of a function that explains the largest residual force of the fitted runs best; none if none does."""
+    columns = evidence.columns
+    worst = int(np.argmax(result.share().max(axis=0)))
+    force = np.zeros(columns.gap.shape)
+    force[:, worst] = TYPICAL * np.sqrt(np.mean(columns.measured[:, worst] ** 2))
+    names = list(columns.states)
+    for many in (1, 2):
+        chosen = list(combinations(names, many))
+        series = [[columns.states[name] for name in some] for some in chosen]
+        factors, _ = evidence.compare_laws(result.judged, force, series)
+        if factors.max() > MIN_LOG_BAYES_FACTOR:
+            return chosen[int(np.argmax(factors))]
+    return ()
+
+
+def _ranking(found: Found) -> tuple[Candidate, ...]:
+    return tuple(
+        Candidate(
+            *s.hypothesis.key, s.gain, s.gain - s.score, s.hypothesis.values(s.start),
+            {name: p.unit for name, p in s.hypothesis.parameters.items()},
+        )
+        for s in found.ranking[:15]
+    )  # fmt: skip
+
+
+def _rejections(
+    found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], untrue: Sequence[str]
+) -> tuple[Rejection, ...]:
+    """What was tried and not named, with the test that it failed."""
+    out = [Rejection(e.name, e.location, "fraction of the gap closed", e.share, MIN_FORCE_SHARE) for e in details]
+    if not found.guess.parts:
+        out += [
+            Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)
+            for s in found.ranking[:3] if s.score < MIN_LOG_BAYES_FACTOR
+        ]  # fmt: skip
+    return (*out, *(Rejection("", "", sentence, np.nan, np.nan) for sentence in untrue))
+
+
+def _traces(task: _Task, evidence: ForceEvidence, result: _Result) -> tuple[InputTrace, ...]:
+    """Force errors of the drive whose error is largest, over the first fitted run, with what the model adds."""
+    columns = evidence.columns
+    rows = slice(columns.starts[0], columns.starts[1])
+    added = evidence.force_of(result.judged.guess)[rows]
+    order = np.argsort(-np.sqrt(np.mean(columns.gap**2, axis=0)) / evidence.shape.std)
+    return tuple(
+        InputTrace(
+            columns.runs[0], "force", task.drives[k], task.unit(task.drives[k]), columns.time[rows],
+            columns.gap[rows, k], columns.gap[rows, k] - added[:, k], added[:, k],
+        )
+        for k in order[:4]
+    )  # fmt: skip
