@@ -116,7 +116,7 @@ class _ForceBuilder(_Builder):
 
         return ForceEffect("payload", body, {"mass": load, **place}, None, names, coefficients)
 
-    def moved(self, body, names, mass, centre, size) -> ForceEffect | None:
+    def move_mass(self, body, names, mass, centre, size) -> ForceEffect | None:
         share = mass * max(self.strength[n] for n in names[:3])
         if share < _NONE:
             return None
@@ -129,7 +129,7 @@ class _ForceBuilder(_Builder):
 
         return ForceEffect("com_offset", body, dict.fromkeys("xyz", way), None, names, coefficients)
 
-    def turned(self, body, names, own) -> ForceEffect | None:
+    def turn_inertia(self, body, names, own) -> ForceEffect | None:
         upper = own[np.triu_indices(3)]
         share = max(self.strength[n] * abs(x) for n, x in zip(names, upper, strict=True))
         if share < _NONE:
@@ -139,7 +139,7 @@ class _ForceBuilder(_Builder):
         ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
         return ForceEffect("inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper)
 
-    def late(self, name: str, place: str, column: str, low: float) -> ForceEffect | None:
+    def delay(self, name: str, place: str, column: str, low: float) -> ForceEffect | None:
         facts = self.number(column, "s")
         if facts is None:
             return None

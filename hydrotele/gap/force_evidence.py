@@ -121,7 +121,7 @@ def estimate_noise(columns: Columns) -> NoiseShape:
 
 
 def _free_laws(columns: Columns) -> np.ndarray:
-    """(n, k, l) forces of a typical size: constants of each run, functions of position and rate of their own drive."""
+    """(n, k, l) forces of a typical size: constants of each run, functions of position and rate of the same drive."""
     size, out = TYPICAL * np.sqrt(np.mean(columns.measured**2, axis=0)), []
     runs = np.repeat(np.eye(len(columns.runs)), np.diff(columns.starts), axis=0)
     for k, drive in enumerate(columns.drives):
@@ -246,7 +246,7 @@ class ForceEvidence(GapModel):
     # -- errors --
 
     def coefficients(self, guess: Guess) -> np.ndarray:
-        """Return what a guess adds along all columns (m,)."""
+        """Return what some effects add along all columns (m,)."""
         out = np.zeros(len(self._place))
         for hypothesis, deviation in guess.parts:
             assert isinstance(hypothesis, ForceEffect)
@@ -256,9 +256,9 @@ class ForceEvidence(GapModel):
 
     def errors(self, guess: Guess) -> np.ndarray:
         """Return errors (m + 1,) whose squares add up to those of all whitened errors, with the form marginalised."""
-        return self._root @ self._along(guess)
+        return self._root @ self._sum_columns(guess)
 
-    def _along(self, guess: Guess) -> np.ndarray:
+    def _sum_columns(self, guess: Guess) -> np.ndarray:
         return np.append(-self.coefficients(guess) / self._unit, 1.0)
 
     def _slopes(self, guess: Guess, errors: np.ndarray) -> np.ndarray:
@@ -267,19 +267,19 @@ class ForceEvidence(GapModel):
 
     def _moves(self, guess: Guess, nudges: np.ndarray) -> np.ndarray:
         """(m + 1, P) change of the combination of columns per deviation."""
-        here, out = self._along(guess), []
+        here, out = self._sum_columns(guess), []
         for k, nudge in enumerate(nudges):
             moved = guess.deviation
             moved[k] += nudge
-            out.append((self._along(guess.at(moved)) - here) / nudge)
+            out.append((self._sum_columns(guess.at(moved)) - here) / nudge)
         return np.column_stack(out) if out else np.zeros((len(here), 0))
 
     def _columns(self, values: np.ndarray) -> np.ndarray:
         """(E, m) whitened columns of the base, as its errors."""
         rows, channels, count = values.shape
-        return self._filtered(values, self._levels)[0].reshape(rows * channels, count)
+        return self._filter_errors(values, self._levels)[0].reshape(rows * channels, count)
 
-    def _filtered(self, values: np.ndarray, levels: Levels) -> tuple[np.ndarray, np.ndarray]:
+    def _filter_errors(self, values: np.ndarray, levels: Levels) -> tuple[np.ndarray, np.ndarray]:
         """Whitened values (n, k, m) with their spread (n, k)."""
         return whiten_forces(values, self._missing, self._first, self._fade, levels.noise, levels.sizes)
 
@@ -287,7 +287,7 @@ class ForceEvidence(GapModel):
         """Root (m + 1, m + 1) of the sums of squares with the form marginalised, and twice the log of its spreads."""
         key = levels.noise.tobytes() + levels.sizes.tobytes()
         if key not in self._roots:
-            whitened, spread = self._filtered(self._values, levels)
+            whitened, spread = self._filter_errors(self._values, levels)
             flat = whitened.reshape(-1, whitened.shape[2])
             square, own = flat.T @ flat, self._form
             inner = square[np.ix_(own, own)] + np.diag(self._form_precision)
@@ -304,19 +304,19 @@ class ForceEvidence(GapModel):
 
     # -- noise levels --
 
-    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
-        """Re-estimate the levels of noise and residual forces of a guess."""
-        along, levels = self._along(guess), self._levels
+    def judge(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """Re-estimate the levels of noise and residual forces of a set of effects."""
+        along, levels = self._sum_columns(guess), self._levels
         rest, form = self._values @ along, self._values[:, :, self._form]
         for _ in range(2):  # the form of friction and the levels in turn
-            filtered, _ = self._filtered(np.concatenate([form, rest[:, :, None]], axis=2), levels)
+            filtered, _ = self._filter_errors(np.concatenate([form, rest[:, :, None]], axis=2), levels)
             flat = filtered.reshape(-1, filtered.shape[2])
             square = flat.T @ flat
             inner = square[:-1, :-1] + np.diag(self._form_precision)
             value = np.linalg.solve(inner, square[:-1, -1])
             left = rest - form @ value
             levels = self._most_likely(left, levels)
-        whitened, spread = self._filtered(left[:, :, None], levels)
+        whitened, spread = self._filter_errors(left[:, :, None], levels)
         whitened = np.where(self._missing, np.nan, whitened[:, :, 0])
         more = float(value @ (self._form_precision * value)) + self._log_det(inner)
         tracks = []
@@ -353,9 +353,9 @@ class ForceEvidence(GapModel):
     def residual_gain(self, judged: Judged) -> np.ndarray:
         """Return twice the log likelihood ratio (k,) of a residual force in each channel against none."""
         levels = judged.tracks[0].levels
-        left, losses = (self._values @ self._along(judged.guess))[:, :, None], []
+        left, losses = (self._values @ self._sum_columns(judged.guess))[:, :, None], []
         for sizes in (levels.sizes, np.full(len(levels.sizes), np.exp(_LOG_SIZES[0]))):
-            whitened, spread = self._filtered(left, replace(levels, sizes=sizes))
+            whitened, spread = self._filter_errors(left, replace(levels, sizes=sizes))
             losses.append(np.sum(whitened[:, :, 0] ** 2 + 2.0 * np.log(spread), axis=0))
         return losses[1] - losses[0]
 
@@ -375,7 +375,7 @@ class ForceEvidence(GapModel):
         return calibration_of(table)
 
     def set_base(self, judged: Judged) -> Judged:
-        """Whiten with the levels of a guess."""
+        """Whiten with the levels of a set of effects."""
         self.tracks, self._levels = judged.tracks, judged.tracks[0].levels  # type: ignore[assignment]
         self._root, _ = self._root_of(self._levels)
         return judged
@@ -389,7 +389,7 @@ class ForceEvidence(GapModel):
         for _ in range(_STEPS):
             self.set_base(judged)
             fit = self.fit(judged.guess)
-            again = self.judged(fit.guess)
+            again = self.judge(fit.guess)
             if again.loss > judged.loss - _SETTLED:
                 break
             judged = again
@@ -403,15 +403,15 @@ class ForceEvidence(GapModel):
         self._levels = replace(levels, sizes=residual_scale * levels.sizes)
         self._root, _ = self._root_of(self._levels)
         fit = self.fit(guess)
-        judged = self.judged(fit.guess)
+        judged = self.judge(fit.guess)
         self.set_base(now)
         return judged, fit
 
     def linearise(self, guess: Guess, versions: Sequence[Version], uncertain: Hypothesis) -> "ForceLinearisation":
         """Return combinations of the columns."""
-        here, groups = self._along(guess), []
+        here, groups = self._sum_columns(guess), []
         for version in versions:
-            parts = [self._along(guess.plus(version.hypothesis, step)) - here for step in version.steps.T]
+            parts = [self._sum_columns(guess.plus(version.hypothesis, step)) - here for step in version.steps.T]
             groups.append(np.column_stack(parts) / version.lengths)
         whole = guess.plus(uncertain, np.zeros(uncertain.size)) if uncertain.size else guess
         moves = self._moves(whole, whole.nudges())
@@ -443,7 +443,7 @@ class ForceEvidence(GapModel):
         return covariance * np.outer(wide, wide)
 
     def force_of(self, guess: Guess) -> np.ndarray:
-        """Return the drive forces (n, k) that a guess adds to the given model [N] or [N m]."""
+        """Return the drive forces (n, k) that some effects add to the given model [N] or [N m]."""
         return self.columns.matrix @ self.coefficients(guess)
 
     def compare_laws(
@@ -467,7 +467,7 @@ class ForceEvidence(GapModel):
         own = self._values @ self._moves(judged.guess, judged.guess.nudges())
         form = self._values[:, :, self._form] / np.sqrt(self._form_precision)
         nuisance = self._columns(np.concatenate([own, form], axis=2))
-        left = self._columns((self._values @ self._along(judged.guess))[:, :, None])[:, 0]
+        left = self._columns((self._values @ self._sum_columns(judged.guess))[:, :, None])[:, 0]
         terms = NormalEquations.of(left, groups, nuisance)
         scales = np.repeat([OWN_SCALE, 1.0], [own.shape[2], form.shape[2]])
         marginal = terms.marginalise(scales)
@@ -483,7 +483,7 @@ class ForceLinearisation:
     versions: Sequence[Version]
     groups: Sequence[np.ndarray]
     nuisance: np.ndarray
-    own: np.ndarray
+    is_own: np.ndarray
     fraction: float = 1.0
     laws: Sequence[LawForm] = ()
     parameters: Sequence[tuple[str, float]] = ()

@@ -111,7 +111,7 @@ class _Task(NamedTuple):
         return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
 
     def effects_of(self, guess: Guess) -> list[tuple[ForceEffect, np.ndarray]]:
-        """Effects of a guess with their parameter values, without the calibration."""
+        """Accepted effects with their parameter values, without the calibration."""
         return [(h, np.array(list(h.values(d).values()))) for h, d in guess.parts
                 if h.name != CALIBRATION and isinstance(h, ForceEffect)]  # fmt: skip
 
@@ -140,7 +140,7 @@ class _Result:
         return self.sizes / np.sqrt(np.mean(self.then.measured**2, axis=0))
 
     @property
-    def lacking(self) -> np.ndarray:
+    def is_lacking(self) -> np.ndarray:
         """(2, k) whether a force is missing in the fitted runs, and in the held-out run."""
         return self.share() > MIN_FORCE_SHARE
 
@@ -184,27 +184,27 @@ def find_force_gap(
     chances = _probabilities(evidence, found)
     small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
              for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
-    judged, untrue = _without(evidence, found.judged, small), list(small.values())
+    judged, untrue = _remove_effects(evidence, found.judged, small), list(small.values())
     varying: dict[Key, str] = {}
     while varying := _varying(evidence, judged):
         untrue += varying.values()
-        judged = _without(evidence, judged, varying)
+        judged = _remove_effects(evidence, judged, varying)
     details: tuple[NamedEffect, ...] = ()
     then = build_columns([heldout], mechanism, task.band)
     result = _evaluate(task, evidence, judged, then)
     while True:
         if not _error_ratio(task, evidence, result) <= _WORSE:
             untrue.append(_REJECTED)
-            evidence, found = _unfitted(task)
+            evidence, found = _given_model(task)
             result = _evaluate(task, evidence, found.judged, then)
-        named = _named(task, evidence, result, chances)
-        named, more = without_details(named, bool(result.lacking.any()), task.drives)
+        named = _describe_effects(task, evidence, result, chances)
+        named, more = without_details(named, bool(result.is_lacking.any()), task.drives)
         unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
         named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
         details += more
         if not more:
             break
-        judged = _without(evidence, result.judged, {(e.name, e.location) for e in more})
+        judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in more})
         result = _evaluate(task, evidence, judged, then)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
@@ -220,12 +220,13 @@ def find_force_gap(
         f"Forces are compared below {task.band:.3g} Hz.",
         *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
     ]
+    of_fit, of_heldout = result.is_lacking
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
-             for k, drive in enumerate(task.drives) if result.lacking[1, k] and not result.lacking[0, k]]  # fmt: skip
+             for k, drive in enumerate(task.drives) if of_heldout[k] and not of_fit[k]]  # fmt: skip
     more += [words for effect in named if (words := answer_words(effect))]
     tell("done", 1.0)
     return Gap(
-        machine=given, patched=result.patched, verdict=verdict_of(named, bool(result.lacking.any()), 1.0),
+        machine=given, patched=result.patched, verdict=verdict_of(named, bool(result.is_lacking.any()), 1.0),
         effects=named, unknown=unknown, size=GapSize(total[0], total[1], 1.0, METRIC), ranking=_ranking(found),
         before=before, after=after,
         laws={"force": {
@@ -316,10 +317,10 @@ def _evidence(task: _Task, columns: Columns, shape: NoiseShape | None = None) ->
     )  # fmt: skip
 
 
-def _unfitted(task: _Task) -> tuple[ForceEvidence, Found]:
+def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     """Evidence on the readings as they are, and a search that found nothing."""
     evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band))
-    judged = evidence.judged(Guess())
+    judged = evidence.judge(Guess())
     return evidence, Found(judged, judged, None, (), (), (), (), None)
 
 
@@ -336,12 +337,12 @@ def _not_named(key: Key, values: Mapping[str, float]) -> str:
     return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
 
 
-def _without(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
+def _remove_effects(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
     """Fit a model again without some effects."""
     if not dropped:
         return judged
     parts = tuple(part for part in judged.guess.parts if part[0].key not in dropped)
-    rest = evidence.judged(Guess(parts))
+    rest = evidence.judge(Guess(parts))
     return evidence.settle(rest)[0] if parts else rest
 
 
@@ -396,12 +397,12 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
         now = build_columns([task.heldout], better, task.band, patch.errors)
     heldout = _evidence(task, now, evidence.shape)
     sizes = []
-    for one, own in ((evidence, judged), (heldout, heldout.judged(Guess()))):
-        sizes.append(_missing(one, own))
+    for one, own in ((evidence, judged), (heldout, heldout.judge(Guess()))):
+        sizes.append(_missing_forces(one, own))
     return _Result(judged, patched, then, now, np.array(sizes))
 
 
-def _missing(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
+def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
     """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
     rest = evidence.columns.gap - evidence.force_of(judged.guess)
     found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
@@ -432,7 +433,7 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
         moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
         own = int(np.argmax(moved / evidence.shape.std))
-        now, without = (_missing(evidence, one)[own] ** 2 for one in (found.judged, rest))
+        now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, rest))
         trust = believed_part(1.0 - now / without if without > now else 0.0)
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
@@ -442,7 +443,7 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
     return out
 
 
-def _named(
+def _describe_effects(
     task: _Task, evidence: ForceEvidence, result: _Result, chances: Mapping[Key, tuple[float, tuple[Alternative, ...]]]
 ) -> tuple[NamedEffect, ...]:  # fmt: skip
     """Effects of a model with probabilities, intervals, and the fraction of the held-out gap that each closes."""

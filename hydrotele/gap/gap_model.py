@@ -27,7 +27,7 @@ class Linearisation(Protocol):
         ...
 
     @property
-    def own(self) -> np.ndarray:
+    def is_own(self) -> np.ndarray:
         """Return for each nuisance column (K,) whether it is a parameter of the model itself."""
         ...
 
@@ -71,8 +71,8 @@ class Linearisation(Protocol):
 class GapModel(Protocol):
     """A model and its runs, for `gap.model_search`.
 
-    A guess is a set of effects with parameters. The base is the guess whose filter gains and noise levels the errors of
-    other guesses are whitened with.
+    A guess is one set of effects with parameters. The base is the guess whose filter gains and noise levels whiten the
+    errors of others.
     """
 
     keep: Callable[[Judged], None]
@@ -89,7 +89,7 @@ class GapModel(Protocol):
         ...
 
     def uncertain_parameters(self, guess: Guess, scale: float = 1.0) -> Hypothesis:
-        """Return the uncertain parameters that a guess does not have as one group, empty if it has that group.
+        """Return the uncertain parameters that are not among the effects as one group, empty if it has that group.
 
         Args:
             guess: the guess.
@@ -97,8 +97,8 @@ class GapModel(Protocol):
         """
         ...
 
-    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
-        """Re-estimate the noise levels of a guess, starting from those of the base.
+    def judge(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """Re-estimate the noise levels of a set of effects, starting from those of the base.
 
         Args:
             guess: the guess.
@@ -112,7 +112,7 @@ class GapModel(Protocol):
         ...
 
     def fit(self, guess: Guess, steps: int) -> Fit:
-        """Fit the parameters of a guess with the gains of the base."""
+        """Fit the parameters of some effects with the gains of the base."""
         ...
 
     def settle(self, judged: Judged) -> tuple[Judged, Fit]:
@@ -154,11 +154,11 @@ class GapModel(Protocol):
     def compare_disturbances(
         self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
     ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
-        """Compare forces that act for a while or periodically with none.
+        """Compare force pulses and periodic forces with none.
 
         Args:
             judged: the base.
-            candidates: effects, among them those that act for a while.
+            candidates: effects, among them pulses.
             scales: factors on the residual inputs.
 
         Returns:

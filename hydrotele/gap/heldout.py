@@ -44,7 +44,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         candidates: the effects.
     """
     run, data = evidence.data.heldout, evidence.data
-    free = [_only(h, d, run.name) for h, d in found.guess.parts]
+    free = [_select_run(h, d, run.name) for h, d in found.guess.parts]
     other = Evidence(data, (run,), 1, evidence.step, lacking=True)
     model = MachineModel(other)
     try:
@@ -81,7 +81,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         other.close()
 
 
-def _only(h: Hypothesis, deviation: np.ndarray, run: str) -> tuple[Hypothesis, np.ndarray]:
+def _select_run(h: Hypothesis, deviation: np.ndarray, run: str) -> tuple[Hypothesis, np.ndarray]:
     """Return a hypothesis in which only the parameters of a run are free."""
     own = [k for k, key in enumerate(h.parameters) if h.run_of(key) == run]
     if not own:

@@ -280,7 +280,7 @@ def list_forms(
         smoothing = facts.drive.friction.smoothing_velocity
         tables = {v: Table((v,), (points,)) for v, points in place_knots(seen, axis, _KNOTS[1], smoothing).items()}
         if has_laws:
-            size = _TYPICAL * float(input_sizes(machine, [Input(_side(balance), axis)])[0])
+            size = _TYPICAL * float(input_sizes(machine, [Input(_side_of(balance), axis)])[0])
             forms += [LawForm(balance, axis, table, size, smoothing) for table in tables.values()]
         for effect in effects:
             if (
@@ -335,7 +335,7 @@ def place_knots(seen: Sequence[Seen], axis: str, count: int, smoothing: float) -
     return found
 
 
-def _side(balance: str) -> str:
+def _side_of(balance: str) -> str:
     return "flow_head" if balance == THROUGH else balance
 
 

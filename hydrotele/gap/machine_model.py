@@ -52,8 +52,8 @@ class MachineModel(GapModel):
         table = {k: dataclasses.replace(p, prior_std=scale * p.prior_std) for k, p in group.parameters.items()}
         return dataclasses.replace(group, parameters=table)
 
-    def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
-        """Re-estimate the noise levels of a guess."""
+    def judge(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
+        """Re-estimate the noise levels of a set of effects."""
         return self.evidence.judged(guess, same, reopened)
 
     def set_base(self, judged: Judged) -> Judged:
@@ -148,7 +148,7 @@ class MachineModel(GapModel):
         Slow noise of several sensors is explained by residual inputs as well, and each channel alone then shows too
         little of it. So all channels get a first-order part at once, and the residual inputs must bring their evidence
         anew. Coloured noise that was found before an effect that changes the spectra is looked for again. Without
-        residual inputs and coloured noise nothing of this can be hidden.
+        residual inputs and coloured noise, none of it can be hidden.
         """
         evidence, levels = self.evidence, judged.tracks[0].levels
         if not levels.inputs and not levels.colours:
@@ -158,7 +158,7 @@ class MachineModel(GapModel):
             total[colour.channel] = np.hypot(total[colour.channel], colour.size)
         period = max(track.run.period for track in judged.tracks)
 
-        def charged(found: Judged) -> float:
+        def charged_score(found: Judged) -> float:
             return found.loss + min_gain * len(found.tracks[0].levels.colours)
 
         def with_noise(white: np.ndarray, colours: tuple[Colour, ...]) -> Judged:
@@ -171,7 +171,7 @@ class MachineModel(GapModel):
             return with_noise(shares * total, tuple(colours))
 
         common = {rows: first_order(rows) for rows in _CORRELATION_ROWS}
-        best_rows = min(common, key=lambda rows: charged(common[rows]))
+        best_rows = min(common, key=lambda rows: charged_score(common[rows]))
         common |= {rows: first_order(rows) for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
         found = [judged, *common.values()]
         if levels.colours:
@@ -179,7 +179,7 @@ class MachineModel(GapModel):
             evidence.set_base(white)
             again = self.propose_noise(white, min_gain)
             found += [white, *([again] if again else [])]
-        return evidence.set_base(min(found, key=charged))
+        return evidence.set_base(min(found, key=charged_score))
 
 
 def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
@@ -206,7 +206,7 @@ class FilterLinearisation:
         return self.table.versions
 
     @property
-    def own(self) -> np.ndarray:
+    def is_own(self) -> np.ndarray:
         """Return (K,) whether a nuisance column is a parameter of the model."""
         return self.table.own
 
@@ -221,21 +221,21 @@ class FilterLinearisation:
         return self.table.parameters
 
     @cached_property
-    def seen(self) -> list[Seen]:
+    def seen_runs(self) -> list[Seen]:
         """What the smoother says of each run."""
         return [see_run(self.machine, self.evidence.data, track) for track in self.tracks]
 
     def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
         """Return laws of the balances with residual inputs."""
-        return list_forms(self.evidence, judged, self.seen, effects, has_laws)
+        return list_forms(self.evidence, judged, self.seen_runs, effects, has_laws)
 
     def list_pairs(self, single: LawForm) -> list[LawForm]:
         """Return products with the other variables of the drive."""
-        return list_pairs(self.seen, single)
+        return list_pairs(self.seen_runs, single)
 
     def with_laws(self, laws: Sequence[LawForm]) -> "FilterLinearisation":
         """Return the same with the columns of laws."""
-        table = self.table.with_laws(laws, self.machine, self.tracks, self.seen, self.evidence.map)
+        table = self.table.with_laws(laws, self.machine, self.tracks, self.seen_runs, self.evidence.map)
         return dataclasses.replace(self, table=table)
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:

@@ -660,9 +660,9 @@ class _Builder:
             yield self.payload(body, names, mass, centre, size)
             if mass <= 0.0:
                 continue
-            yield self.moved(body, names[1:], mass, centre, size)
+            yield self.move_mass(body, names[1:], mass, centre, size)
             own = about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-            yield self.turned(body, names[4:], own)
+            yield self.turn_inertia(body, names[4:], own)
 
     def payload(self, body, names, mass, centre, size) -> MechanismEffect | None:
         move = max(self.strength[n] for n in names[1:4])
@@ -684,7 +684,7 @@ class _Builder:
             np.concatenate([[0.0], centre]),
         )  # fmt: skip
 
-    def moved(self, body, names, mass, centre, size) -> MechanismEffect | None:
+    def move_mass(self, body, names, mass, centre, size) -> MechanismEffect | None:
         share = mass * max(self.strength[n] for n in names[:3])
         if share < _NONE:
             return None
@@ -697,7 +697,7 @@ class _Builder:
 
         return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3))
 
-    def turned(self, body, names, own) -> MechanismEffect | None:
+    def turn_inertia(self, body, names, own) -> MechanismEffect | None:
         upper = own[np.triu_indices(3)]
         share = max(self.strength[n] * abs(x) for n, x in zip(names, upper, strict=True))
         if share < _NONE:
@@ -716,16 +716,16 @@ class _Builder:
             force = self.units(drive)[0]
             yield self.linear("force_offset", drive, "offset", f"offset.{drive}", force)
             yield self.scale(drive)
-            yield self.late("force_delay", drive, f"delay.force.{drive}", 0.0)
-        yield self.late("clock_offset", "force", "delay.force", -_SECOND)
+            yield self.delay("force_delay", drive, f"delay.force.{drive}", 0.0)
+        yield self.delay("clock_offset", "force", "delay.force", -_SECOND)
         for joint in self.columns.sizes:
             unit, kind = self.units(joint)[1], "length" if self.units(joint)[1] == "m" else "angle"
             column = f"offset.position.{joint}"
             yield self.linear(f"{kind}_offset", joint, "offset", column, unit)
-            yield self.late(f"{kind}_delay", joint, f"delay.position.{joint}", 0.0)
+            yield self.delay(f"{kind}_delay", joint, f"delay.position.{joint}", 0.0)
         yield self.tilt()
 
-    def late(self, name: str, place: str, column: str, low: float) -> MechanismEffect | None:
+    def delay(self, name: str, place: str, column: str, low: float) -> MechanismEffect | None:
         facts = self.number(column, "s")
         if facts is None:
             return None

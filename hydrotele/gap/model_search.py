@@ -160,7 +160,7 @@ def search_model(
     """
     tell = progress or (lambda text, share: None)
     tell("estimate the noise levels of the given model", 0.0)
-    given = Model(settle_noise(model, model.judged(Guess())))
+    given = Model(settle_noise(model, model.judge(Guess())))
     model.keep(given.judged)
     candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
     rounds, first = add_effects(model, given, candidates, has_laws, tell)
@@ -231,7 +231,7 @@ def settle_noise(model: GapModel, judged: Judged) -> Judged:
     """Re-estimate the noise levels of a model until its likelihood no longer changes; it becomes the base."""
     for _ in range(_MAX_NOISE_ROUNDS):
         model.set_base(judged)
-        again = model.judged(judged.guess, same=True)
+        again = model.judge(judged.guess, same=True)
         if again.loss > judged.loss - _SETTLED:
             break
         judged = again
@@ -248,7 +248,7 @@ def settle(model: GapModel, one: Model) -> Model:
         return Model(settle_noise(model, one.judged))
     found = _settle_fit(model, one.judged)
     while any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
-        again = _settle_fit(model, model.judged(model.select_priors(found.guess), same=True))
+        again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True))
         if again.score > found.score - _SETTLED:
             model.set_base(found.judged)
             break
@@ -302,7 +302,7 @@ def propose(
             by_run, loss = table.equations(residual_scale)
             terms = sum_equations(by_run)
             for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration or table.laws else None]:
-                scales = np.where(table.own, OWN_SCALE, parameter_scale)
+                scales = np.where(table.is_own, OWN_SCALE, parameter_scale)
                 marginal = terms.marginalise(scales)
                 total = loss - terms.squares + marginal.loss
                 starts.append(total)
@@ -387,7 +387,7 @@ def propose_pair(
     """
     by_run, _ = table.equations(residual_scale, chosen)
     chosen_versions = [table.versions[g] for g in chosen]
-    marginal = sum_equations(by_run).marginalise(np.where(table.own, OWN_SCALE, 0.0))
+    marginal = sum_equations(by_run).marginalise(np.where(table.is_own, OWN_SCALE, 0.0))
     edges = np.cumsum([0, *(v.steps.shape[1] for v in chosen_versions)])
     gram = marginal.blocks[0]
     chances, _ = sum_of_single_effects(gram, marginal.right, edges, _COMPONENTS)
@@ -466,7 +466,7 @@ def without_part(model: GapModel, given: Model, now: Model, index: int, rounds: 
         if keys_of(known.before) == {h.key for h in guess.hypotheses} and known.before.colours == now.colours:
             return known.before
     model.set_base(now.judged)
-    rest = settle(model, Model(model.judged(guess, reopened=True)))
+    rest = settle(model, Model(model.judge(guess, reopened=True)))
     model.set_base(now.judged)
     return rest
 
@@ -548,7 +548,7 @@ def add_rival(model: GapModel, rest: Model, origin: Round, other: Model) -> Mode
             guess = guess.plus(hypothesis, deviation)
     model.set_base(rest.judged)
     fit = model.fit(guess, 2)
-    return Model(model.judged(fit.guess), fit, fit.whole_penalty)
+    return Model(model.judge(fit.guess), fit, fit.whole_penalty)
 
 
 def _rival(model: Model, rest: Model) -> Rival:
