@@ -154,7 +154,7 @@ def test_a_machine_with_coloured_sensor_noise_has_no_gap():
         assert found == pytest.approx(stated, rel=0.15)  # 1000 readings with a correlation time of 8 rows
 
 
-@pytest.mark.daily("0.1-0.0")
+@pytest.mark.nightly
 @pytest.mark.parametrize(("memory", "frequency"), [(0.1, 0.0), (0.3, 0.0), (0.04, 30.0)])
 def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, frequency):
     """Half of the noise variance is coloured; the residual inputs must not stand for the rest."""
