@@ -35,10 +35,9 @@ CODE_VERSIONS = (
     sysconfig.get_config_var("SOABI"),  # Python's binary interface, of which all releases of 3.11 share one
     numba.__version__,  # a patch release may change generated code, pickled types or the runtime
     llvmlite.__version__,
-    ".".join(numpy.__version__.split(".")[:2]),  # numba depends on the minor version; the code on neither
+    ".".join(numpy.__version__.split(".")[:2]),  # selects numba's implementations; arrays are read by numba's runtime
 )
 """Versions on which compiled code depends."""
-_TYPES_INDEX = 5  # index of the printed types after the library in the result of `CompileResult._reduce`
 _MAX_LOCK_WAIT = 300.0  # s, longest wait for another process, which may have failed without exiting
 _LOG = logging.getLogger("hydrotele")
 _notes: set[str] = set()
@@ -116,23 +115,16 @@ class CodeCache(NullCache):
                 _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
             elif not cres.lifted and not cres.library.has_dynamic_globals:
                 key = self._code_key(sig, cres.library.codegen)
-                content = dumps((key, external_callees(cres), self._reduce(cres)))
+                cres.library.is_copied = self._is_inlined
+                # Without the printed types of all variables, which take a third of the space.
+                code = cres._replace(type_annotation="")._reduce()
+                content = dumps((key, external_callees(cres), code))
                 _write_atomically(self._folder / self._file_name(key), hashlib.sha256(content).digest() + content)
         except OSError as error:
             reason = f"{self._folder} cannot be written, {error.strerror or error}"
             _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
         finally:
             self._release_lock()
-
-    def _reduce(self, cres: Any) -> tuple:
-        """Return the parts of compiled code that are stored.
-
-        These are the parts that numba stores, except the printed types of all variables. Code that callers do
-        not copy is stored without LLVM code. Both together take three quarters of the space.
-        """
-        library, *others = cres._reduce()
-        others[_TYPES_INDEX] = ""
-        return (library if self._is_inlined else cres.library.serialize_object_code(), *others)
 
     def _load(self, folder: Path | None, sig: Any, target_context: Any) -> Any:
         if folder is None:

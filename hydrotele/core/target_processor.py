@@ -48,10 +48,18 @@ def _host_processor() -> str | None:
 
 
 class _Library(JITCodeLibrary):
-    """Machine code of one function, and its LLVM code if it can be copied into callers."""
+    """Machine code of one function, stored together with its LLVM code only if callers copy it.
 
-    def serialize_object_code(self) -> tuple:
-        """Return the machine code and the names of its symbols, without LLVM code, for `_unserialize`."""
+    Attributes:
+        is_copied: whether callers copy the LLVM code instead of linking to the machine code.
+    """
+
+    is_copied = True
+
+    def serialize_using_object_code(self) -> tuple:
+        """Return the parts that are stored, for `_unserialize`."""
+        if self.is_copied:
+            return super().serialize_using_object_code()
         self._ensure_finalized()
         groups = self._final_module.functions, self._final_module.global_variables
         symbols = [value.name for group in groups for value in group if not value.is_declaration]
