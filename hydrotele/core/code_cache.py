@@ -65,14 +65,14 @@ class CodeCache(NullCache):
             compiled functions and from C.
         shipped_folder: folder with code of the function's module that was shipped with the package;
             it is only read. None if there is none.
-        is_inlined: whether callers copy the code, so that LLVM's code is stored, too.
+        is_copied: whether callers copy the code, so that LLVM's code is stored, too.
     """
 
     def __init__(
-        self, function, folder: Path | None, form: str, shipped_folder: Path | None = None, is_inlined: bool = False
+        self, function, folder: Path | None, form: str, shipped_folder: Path | None = None, is_copied: bool = False
     ) -> None:
         self._function, self._folder, self._form = function, folder, form
-        self._shipped_folder, self._is_inlined = shipped_folder, is_inlined
+        self._shipped_folder, self._is_copied = shipped_folder, is_copied
         self._lock_handle: int | None = None
 
     @property
@@ -115,7 +115,7 @@ class CodeCache(NullCache):
                 _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
             elif not cres.lifted and not cres.library.has_dynamic_globals:
                 key = self._code_key(sig, cres.library.codegen)
-                cres.library.is_copied = self._is_inlined
+                cres.library.is_copied = self._is_copied
                 # Without the printed types of all variables, which take a third of the space.
                 code = cres._replace(type_annotation="")._reduce()
                 content = dumps((key, external_callees(cres), code))

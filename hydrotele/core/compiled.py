@@ -90,7 +90,7 @@ def _make_dispatcher(function, **options: Any):
     called: Any = Dispatcher(function, targetoptions=options | {"no_cpython_wrapper": True})
     callee = Callee(called, inline=options.get("forceinline", False))
     made._cache = _function_cache(function, "python")
-    called._cache = _function_cache(function, "called", is_inlined=not callee.is_separate)
+    called._cache = _function_cache(function, "called", is_copied=not callee.is_separate)
     for dispatcher in (made, called):
         dispatcher.get_call_template, dispatcher.get_overload = callee.call_template, callee.overload_key
     if callee.is_separate and isinstance(called._cache, CodeCache):
@@ -191,7 +191,7 @@ def _stop_process(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _function_cache(function, form: str, is_inlined: bool = False) -> NullCache:
+def _function_cache(function, form: str, is_copied: bool = False) -> NullCache:
     """Return the disk cache for the compiled code of a function.
 
     For a function of another package it is a cache that stores nothing.
@@ -199,12 +199,12 @@ def _function_cache(function, form: str, is_inlined: bool = False) -> NullCache:
     Args:
         function: the Python function.
         form: callers of the code: "python", "called" for compiled functions, or "callback" for C.
-        is_inlined: whether callers copy the code instead of linking to it.
+        is_copied: whether callers copy the code instead of linking to it.
     """
     module = function.__module__
     if _read_source(module) is None:
         return NullCache()
-    return CodeCache(function, _module_cache_folder(module), form, _module_shipped_folder(module), is_inlined)
+    return CodeCache(function, _module_cache_folder(module), form, _module_shipped_folder(module), is_copied)
 
 
 def cache_folder() -> Path | None:

@@ -15,7 +15,7 @@ Source of the levels: x86-64 psABI, version 1.0, table 3.1.
 from typing import Any
 
 from llvmlite import binding
-from numba.core import cpu, registry
+from numba.core import registry
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompileResult
@@ -104,7 +104,7 @@ class _Target(registry.CPUTarget):
 
     def __init__(self) -> None:
         super().__init__("cpu")
-        shared: cpu.CPUContext = registry.cpu_target.target_context
+        shared: Any = registry.cpu_target.target_context
         self._context = shared.subtarget(_internal_codegen=_Codegen("hydrotele.exec"))
 
     @property
