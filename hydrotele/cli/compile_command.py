@@ -48,11 +48,14 @@ def _compile_teleoperation() -> None:
 
 
 def _compile_runs() -> None:
+    from hydrotele.machine.machine_file import load_machine
+    from hydrotele.run.replay import replay_log
     from hydrotele.run.run import run_scenario
     from hydrotele.scenario.scenario import load_scenario
 
     for name in ("dig", "press_stiffness"):
         run_scenario(load_scenario(name, {"duration": "0.2"}))
+    replay_log(run_scenario(load_scenario("excitation", {"duration": "0.2"})).measured, load_machine("cat215"))
 
 
 def _compile_environments() -> None:
@@ -88,11 +91,13 @@ def _compile_gap() -> None:
         for k in range(2):
             scenario = load_scenario("excitation", {"duration": "2", "seed": str(k)})
             save_log(run_scenario(scenario).measured, Path(folder) / f"{k}.parquet")
-        find_gap(load_dataset(Path(folder), load_machine("cat215")), effects=("valve_gain",))
+        data = load_dataset(Path(folder), load_machine("cat215"))
+        find_gap(data)
+        find_gap(data, effects=("valve_gain",), method="regression")
 
 
 JOBS = (
-    Job("gap", _compile_gap, 130.0),
+    Job("gap", _compile_gap, 140.0),
     Job("environments", _compile_environments, 95.0),
     Job("teleoperation", _compile_teleoperation, 65.0),
     Job("runs", _compile_runs, 15.0),
