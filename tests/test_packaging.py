@@ -12,6 +12,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tools.release.build_wheel import add_compiled_code
+
 ROOT = Path(__file__).resolve().parent.parent
 
 pytest.importorskip("hatchling", reason="the test extra is not installed")
@@ -94,6 +96,21 @@ def test_installed_wheel_finds_its_machines_from_any_folder(wheel, tmp_path):
         str(site / "hydrotele" / "models"),
     ]
     assert (site / "bin" / "hydrotele").is_file()
+
+
+def test_wheel_with_compiled_code_can_be_installed(wheel, tmp_path):
+    folder = tmp_path / "compiled" / "hydrotele.module_0123456789abcdef"
+    folder.mkdir(parents=True)
+    (folder / "law-5.fedcba9876543210.code").write_bytes(b"code")
+    (folder / "law-5.python.lock").touch()
+    (tmp_path / "compiled" / "complete_0123").touch()
+    tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
+    made = add_compiled_code(wheel, tmp_path / "compiled", tag, tmp_path)
+    pip("install", "--quiet", "--no-deps", "--no-index", "--target", tmp_path / "site", made)
+    installed = tmp_path / "site" / "hydrotele" / "compiled_code"
+    names = {path.relative_to(installed).as_posix() for path in installed.rglob("*") if path.is_file()}
+    assert names == {"complete_0123", f"{folder.name}/law-5.fedcba9876543210.code"}
+    assert (tmp_path / "site/hydrotele/models/cat215/machine.yaml").is_file()
 
 
 @pytest.mark.nightly

@@ -14,14 +14,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import typer
-from llvmlite.binding import get_host_cpu_name
 
 import hydrotele
+from hydrotele.core.code_cache import CODE_VERSIONS
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine, format_bar
-from hydrotele.core.compiled import cache_folder
+from hydrotele.core.compiled import SHIPPED_FOLDER, cache_folder
 from hydrotele.core.errors import InputError
+from hydrotele.core.target_processor import processor_name
 
 _POLL = 0.2  # s between two checks of the jobs
 
@@ -48,11 +48,14 @@ def _compile_teleoperation() -> None:
 
 
 def _compile_runs() -> None:
+    from hydrotele.machine.machine_file import load_machine
+    from hydrotele.run.replay import replay_log
     from hydrotele.run.run import run_scenario
     from hydrotele.scenario.scenario import load_scenario
 
     for name in ("dig", "press_stiffness"):
         run_scenario(load_scenario(name, {"duration": "0.2"}))
+    replay_log(run_scenario(load_scenario("excitation", {"duration": "0.2"})).measured, load_machine("cat215"))
 
 
 def _compile_environments() -> None:
@@ -67,6 +70,15 @@ def _compile_environments() -> None:
         env.close()
 
 
+def _compile_laws() -> None:
+    import hydrotele.effects  # noqa: F401, defines the laws
+    from hydrotele.terms.law import LAWS
+    from hydrotele.terms.table import law_index
+
+    for name in LAWS:
+        law_index(name)
+
+
 def _compile_gap() -> None:
     from hydrotele.gap.find import find_gap
     from hydrotele.logs.dataset import load_dataset
@@ -79,14 +91,17 @@ def _compile_gap() -> None:
         for k in range(2):
             scenario = load_scenario("excitation", {"duration": "2", "seed": str(k)})
             save_log(run_scenario(scenario).measured, Path(folder) / f"{k}.parquet")
-        find_gap(load_dataset(Path(folder), load_machine("cat215")), effects=("valve_gain",))
+        data = load_dataset(Path(folder), load_machine("cat215"))
+        find_gap(data)
+        find_gap(data, effects=("valve_gain",), method="regression")
 
 
 JOBS = (
-    Job("gap", _compile_gap, 130.0),
+    Job("gap", _compile_gap, 140.0),
     Job("environments", _compile_environments, 95.0),
     Job("teleoperation", _compile_teleoperation, 65.0),
     Job("runs", _compile_runs, 15.0),
+    Job("laws", _compile_laws, 5.0),
 )
 
 
@@ -98,7 +113,8 @@ def run_job(name: str) -> None:
 def compile_all(processes: int | None = None) -> None:
     """Compile all numerical functions by running jobs in child processes, the longest first.
 
-    A marker file in the cache folder records completion, so that a repeated call does nothing.
+    A marker file in the cache folder records completion, so that a repeated call does nothing. A
+    wheel with compiled code contains this file, too.
 
     Args:
         processes: number of parallel processes, default one per core.
@@ -106,13 +122,12 @@ def compile_all(processes: int | None = None) -> None:
     Raises:
         InputError: there is no usable cache folder, or a job failed.
     """
-    folder = cache_folder()
-    if folder is None:
-        raise InputError("cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder")
-    complete = folder / f"complete_{_hash_sources_and_versions()}"
-    if complete.exists():
+    folder, marker = cache_folder(), f"complete_{_hash_sources_and_versions()}"
+    if any(place is not None and (place / marker).exists() for place in (SHIPPED_FOLDER, folder)):
         typer.echo("all functions are compiled already")
         return
+    if folder is None:
+        raise InputError("cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder")
     processes = processes or len(os.sched_getaffinity(0))
     began, line = time.monotonic(), ProgressLine()
     messages = tempfile.TemporaryDirectory()
@@ -149,17 +164,17 @@ def compile_all(processes: int | None = None) -> None:
         messages.cleanup()
     for old in folder.glob("complete_*"):
         old.unlink()
-    complete.touch()
+    (folder / marker).touch()
     typer.echo(f"all functions are compiled ({time.monotonic() - began:.0f} s)")
 
 
 def _hash_sources_and_versions() -> str:
-    """Return a hash of versions of Python and numba, name of the processor and all sources of the package.
+    """Return a hash of `CODE_VERSIONS`, the name of the processor and all sources of the package.
 
     Equal hashes mean equal compiled code.
     """
     package = Path(hydrotele.__file__).parent
-    text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
+    text = hashlib.sha256(f"{CODE_VERSIONS} {processor_name()}".encode())
     for path in sorted(package.rglob("*.py")):
         text.update(path.read_bytes())
     return text.hexdigest()[:16]

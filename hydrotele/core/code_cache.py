@@ -1,5 +1,8 @@
 """Store compiled code on disk, one file for each function and signature, and verify it before use.
 
+Code is looked up in the folder that the package was shipped with, then in the user's cache folder.
+The shipped folder comes first, because its files refer to symbols of each other.
+
 A file begins with a checksum of the rest. The rest contains the key of the code: signature,
 processor, versions and bytecode. Damaged files, for example after a power cut, and files of another
 key count as missing, so that their code never reaches LLVM. If nothing can be stored, the code is
@@ -12,8 +15,8 @@ import hashlib
 import logging
 import os
 import pickle
-import platform
 import secrets
+import sysconfig
 import time
 from pathlib import Path
 from typing import Any
@@ -28,7 +31,13 @@ from numba.core.serialize import dumps
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine
 from hydrotele.core.linking import external_callees, load_callees
 
-_VERSIONS = platform.python_version(), numba.__version__, llvmlite.__version__, numpy.__version__
+CODE_VERSIONS = (
+    sysconfig.get_config_var("SOABI"),  # Python's binary interface, of which all releases of 3.11 share one
+    numba.__version__,  # a patch release may change generated code, pickled types or the runtime
+    llvmlite.__version__,
+    ".".join(numpy.__version__.split(".")[:2]),  # selects numba's implementations; arrays are read by numba's runtime
+)
+"""Versions on which compiled code depends."""
 _MAX_LOCK_WAIT = 300.0  # s, longest wait for another process, which may have failed without exiting
 _LOG = logging.getLogger("hydrotele")
 _notes: set[str] = set()
@@ -54,10 +63,16 @@ class CodeCache(NullCache):
         folder: cache folder of the function's module; None if no folder is usable.
         form: kind of compiled code, since a function may be compiled for calls from Python, from
             compiled functions and from C.
+        shipped_folder: folder with code of the function's module that was shipped with the package;
+            it is only read. None if there is none.
+        is_copied: whether callers copy the code, so that LLVM's code is stored, too.
     """
 
-    def __init__(self, function, folder: Path | None, form: str) -> None:
+    def __init__(
+        self, function, folder: Path | None, form: str, shipped_folder: Path | None = None, is_copied: bool = False
+    ) -> None:
         self._function, self._folder, self._form = function, folder, form
+        self._shipped_folder, self._is_copied = shipped_folder, is_copied
         self._lock_handle: int | None = None
 
     @property
@@ -70,22 +85,23 @@ class CodeCache(NullCache):
 
         Before None is returned, this process locks this form of the function; `save_overload` releases the lock.
         While another process holds the lock, this call waits for its compiled code, for 300 s at
-        most. Without a cache folder the result is None at once, without a lock.
+        most. Without a cache folder only shipped code is returned, and nothing is locked.
         """
-        if self._folder is None:
+        if self._folder is None and self._shipped_folder is None:
             return None
         target_context.refresh()
-        found = self._load(sig, target_context)
-        if found is None and self._lock_handle is None:
+        found = self._load(self._shipped_folder, sig, target_context) or self._load(self._folder, sig, target_context)
+        if found is None and self._lock_handle is None and self._folder is not None:
             self._lock_handle = _acquire_lock(self._folder, self._function, self._form)
-            found = self._load(sig, target_context)
+            found = self._load(self._folder, sig, target_context)
             if found is not None:
                 self._release_lock()
         return found
 
     def contains(self, sig: Any, target_context: Any) -> bool:
         """Return whether there is a cache file for a signature."""
-        return self._folder is not None and self._code_file(self._code_key(sig, target_context.codegen())).exists()
+        name = self._file_name(self._code_key(sig, target_context.codegen()))
+        return any(folder is not None and (folder / name).exists() for folder in (self._shipped_folder, self._folder))
 
     def save_overload(self, sig: Any, cres: Any) -> None:
         """Write the compiled code of a signature to a cache file, if possible, and release the function's lock.
@@ -99,17 +115,22 @@ class CodeCache(NullCache):
                 _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
             elif not cres.lifted and not cres.library.has_dynamic_globals:
                 key = self._code_key(sig, cres.library.codegen)
-                content = dumps((key, external_callees(cres), cres._reduce()))
-                _write_atomically(self._code_file(key), hashlib.sha256(content).digest() + content)
+                cres.library.is_copied = self._is_copied
+                # Without the printed types of all variables, which take a third of the space.
+                code = cres._replace(type_annotation="")._reduce()
+                content = dumps((key, external_callees(cres), code))
+                _write_atomically(self._folder / self._file_name(key), hashlib.sha256(content).digest() + content)
         except OSError as error:
             reason = f"{self._folder} cannot be written, {error.strerror or error}"
             _warn_once("memory", f"compiled functions are kept in memory only: {reason}")
         finally:
             self._release_lock()
 
-    def _load(self, sig: Any, target_context: Any) -> Any:
+    def _load(self, folder: Path | None, sig: Any, target_context: Any) -> Any:
+        if folder is None:
+            return None
         key = self._code_key(sig, target_context.codegen())
-        content = _read_verified(self._code_file(key))
+        content = _read_verified(folder / self._file_name(key))
         if content is None:
             return None
         stored_key, callees, code = pickle.loads(content)
@@ -120,19 +141,18 @@ class CodeCache(NullCache):
     def _code_key(self, sig: Any, codegen: Any) -> tuple:
         """Return a tuple of all that determines the compiled code of a signature, as the key of its cache file.
 
-        The tuple contains the form of the code, versions of Python, numba, llvmlite and NumPy,
-        signature, processor, qualified name, and hashes of bytecode and closure. It does not
-        contain the sources of called functions; these determine the cache folder.
+        The tuple contains the form of the code, `CODE_VERSIONS`, signature, processor, qualified
+        name, and hashes of bytecode and closure. It does not contain the sources of called
+        functions; these determine the cache folder.
         """
         closure = [cell.cell_contents for cell in self._function.__closure__ or ()]
         parts = self._function.__code__.co_code, dumps(closure) if closure else b""
         digests = [hashlib.sha256(part).hexdigest() for part in parts]
-        return self._form, _VERSIONS, sig, codegen.magic_tuple(), self._function.__qualname__, *digests
+        return self._form, CODE_VERSIONS, sig, codegen.magic_tuple(), self._function.__qualname__, *digests
 
-    def _code_file(self, key: tuple) -> Path:
-        assert self._folder
+    def _file_name(self, key: tuple) -> str:
         digest = hashlib.sha256(repr(key).encode()).hexdigest()
-        return self._folder / f"{cache_file_stem(self._function)}.{digest[:16]}.code"
+        return f"{cache_file_stem(self._function)}.{digest[:16]}.code"
 
     def _release_lock(self) -> None:
         if self._lock_handle is not None:

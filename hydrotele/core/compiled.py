@@ -5,6 +5,7 @@ cache folder for each version of its source and of all sources of the package th
 directly or indirectly. A changed module does not invalidate the caches of unrelated modules, and checkouts with
 the same sources share a cache. The cache contains executable code: it lies in the user's cache
 folder, and no other user may write to it. Damaged cache files are not used (`core.code_cache`).
+A wheel may contain such folders with compiled code, in the folder `compiled_code` of the package.
 
 Only one process compiles a function; other processes that need it wait. Callbacks for C are
 compiled on first use of their address, not at import. Division by zero is not checked.
@@ -24,16 +25,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from numba import njit
 from numba.core import event
 from numba.core.caching import NullCache
-from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 from numba.core.types import Omitted
 
 from hydrotele.core.code_cache import CodeCache, cache_file_stem
 from hydrotele.core.compile_progress import CompileProgress
 from hydrotele.core.linking import Callee
+from hydrotele.core.target_processor import CFunction, Dispatcher
 from hydrotele.core.tuple_references import argument_type
 
 _MAX_UNUSED_AGE = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
@@ -83,15 +83,14 @@ def _make_dispatcher(function, **options: Any):
         The dispatcher for calls from Python.
     """
     options |= {
-        "error_model": "numpy", "nogil": True,
+        "nopython": True, "error_model": "numpy", "nogil": True,
         "no_cfunc_wrapper": True,  # the unused wrapper takes a fifth of the compile time
     }  # fmt: skip
-    compile_with: Any = njit  # its type annotation omits some options
-    made = compile_with(**options)(function)
-    called = compile_with(**options, no_cpython_wrapper=True)(function)
-    made._cache = _function_cache(function, "python")
-    called._cache = _function_cache(function, "called")
+    made: Any = Dispatcher(function, targetoptions=options)
+    called: Any = Dispatcher(function, targetoptions=options | {"no_cpython_wrapper": True})
     callee = Callee(called, inline=options.get("forceinline", False))
+    made._cache = _function_cache(function, "python")
+    called._cache = _function_cache(function, "called", is_copied=not callee.is_separate)
     for dispatcher in (made, called):
         dispatcher.get_call_template, dispatcher.get_overload = callee.call_template, callee.overload_key
     if callee.is_separate and isinstance(called._cache, CodeCache):
@@ -147,7 +146,7 @@ class Callback:
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        made: Any = CFunc(self._function, normalize_signature(self._signature), {}, {"error_model": "numpy"})
+        made: Any = CFunction(self._function, normalize_signature(self._signature), {}, {"error_model": "numpy"})
         made._cache = _function_cache(self._function, "callback")
         made.compile()
         return made
@@ -174,8 +173,7 @@ def compile_in_background(function, code: str) -> None:
         code: Python code that compiles it.
     """
     function = getattr(function, "py_func", function)
-    folder = _module_cache_folder(function.__module__)
-    if folder is None or code in _background_processes or _is_cached(function):
+    if _module_cache_folder(function.__module__) is None or code in _background_processes or _is_cached(function):
         return
     path = os.pathsep.join([str(_PACKAGE_FOLDER.parent), *filter(None, sys.path)])
     _background_processes[code] = process = subprocess.Popen(
@@ -193,7 +191,7 @@ def _stop_process(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _function_cache(function, form: str) -> NullCache:
+def _function_cache(function, form: str, is_copied: bool = False) -> NullCache:
     """Return the disk cache for the compiled code of a function.
 
     For a function of another package it is a cache that stores nothing.
@@ -201,10 +199,12 @@ def _function_cache(function, form: str) -> NullCache:
     Args:
         function: the Python function.
         form: callers of the code: "python", "called" for compiled functions, or "callback" for C.
+        is_copied: whether callers copy the code instead of linking to it.
     """
-    if _read_source(function.__module__) is None:
+    module = function.__module__
+    if _read_source(module) is None:
         return NullCache()
-    return CodeCache(function, _module_cache_folder(function.__module__), form)
+    return CodeCache(function, _module_cache_folder(module), form, _module_shipped_folder(module), is_copied)
 
 
 def cache_folder() -> Path | None:
@@ -237,6 +237,8 @@ def _is_private_folder(folder: Path) -> bool:
 
 _CACHE_FOLDER = cache_folder()
 _PACKAGE_FOLDER = Path(__file__).parent.parent
+SHIPPED_FOLDER = _PACKAGE_FOLDER / "compiled_code"
+"""Folder of compiled code in the package; wheels for Linux on x86-64 contain it."""
 _IMPORT_PATTERN = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +import +([^#\n]*))?", re.M)
 
 
@@ -309,10 +311,20 @@ def _module_cache_folder(module: str) -> Path | None:
     return folder
 
 
+@functools.cache
+def _module_shipped_folder(module: str) -> Path | None:
+    """Return the folder with compiled code of a module that was shipped with the package; None if there is none."""
+    folder = SHIPPED_FOLDER / f"{module}_{source_digest(module)}"
+    return folder if folder.is_dir() else None
+
+
 def _is_cached(function) -> bool:
-    """Return whether the cache contains code of a function of this package, for any argument types."""
-    folder = _module_cache_folder(function.__module__)
-    return folder is not None and any(folder.glob(f"{cache_file_stem(function)}.*.code"))
+    """Return whether there is stored code of a function of this package, for any argument types."""
+    module = function.__module__
+    if _read_source(module) is None:
+        return False
+    folders = _module_shipped_folder(module), _module_cache_folder(module)
+    return any(any(folder.glob(f"{cache_file_stem(function)}.*.code")) for folder in folders if folder is not None)
 
 
 event.register("numba:compile", CompileProgress(_is_cached))

@@ -11,6 +11,7 @@ from typing import Any
 
 from numba.core.typing.templates import make_concrete_template
 
+from hydrotele.core.target_processor import publish_symbol
 from hydrotele.core.tuple_references import argument_type, check_result_type
 
 MAX_INLINED_BYTECODE = 300
@@ -92,6 +93,7 @@ class Callee:
         """
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
+            publish_symbol(result)
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)
             _symbols[symbol] = self.location, tuple(result.signature.args)
         return "symbol", symbol

@@ -15,11 +15,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from llvmlite import binding, ir
-from numba import carray, cfunc, njit, types
+from numba import carray, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hydrotele.core.compiled import compile_without_allocation, compiled
+from hydrotele.core.compiled import Callback, compile_without_allocation, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.terms.drive_state import VARIABLES, DriveState
 from hydrotele.terms.law import LAWS, Law, Numbers, Variable
@@ -118,15 +118,19 @@ def _compile_c_function(law: Law):
     own = compiled(law.function) if not law.source else _compile_uncached(law.function)
     names = {"carray": carray, "DriveState": DriveState, "function": own}
     exec(text, names)  # generated code, because the number of arguments differs between laws
-    pointer = types.CPointer(types.float64)
+    call, pointer = names["call"], types.CPointer(types.float64)
+    call.__module__, call.__name__ = law.function.__module__, law.function.__name__  # the place of its cache
+    call.__qualname__ = f"{law.function.__qualname__}_for_c"
+    called = Callback(call, types.float64(pointer, pointer))
     try:
-        return cfunc(types.float64(pointer, pointer), error_model="numpy")(names["call"])
+        _ = called.address  # compiles
     except Exception as error:  # numba raises many types for an invalid user function
         if not law.source:
             raise
         why = str(error).strip().splitlines()
         message = f"cannot be compiled by numba: {why[0]} ... {why[-1]}"
         raise InputError(f"{law.source}: law {law.name}", message) from None
+    return called
 
 
 def _compile_uncached(function):
