@@ -121,7 +121,8 @@ def trace_inputs(data: Dataset, given: Judged, final: Judged) -> tuple[InputTrac
     index = int(np.argmax([np.mean(np.where(s.known, s.inputs[lead], 0.0) ** 2) for s in seen]))
     before, track = seen[index], given.tracks[index]
     after = see(data, final, final.tracks[index])
-    added = _equivalent_inputs(data.machine, final.guess.machine(data.machine, track.run.name), track)
+    # the patched model has what all runs share
+    added = _equivalent_inputs(data.machine, final.guess.machine(data.machine), track)
     units = input_units(data.machine, levels.inputs)
     time = track.run.start + track.run.period * np.arange(len(track.states))
     traces = []
