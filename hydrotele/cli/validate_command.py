@@ -71,7 +71,14 @@ def _print_estimates(groups: list[EstimateGroup]) -> None:
     count = sum(len(group.keys) for group in groups)
     stdout_console.print(f"{count} lines are estimates; replace the values and remove the marks, in this order:")
     for number, (title, keys) in enumerate(groups, start=1):
-        listed = ", ".join(f"{key} (line {line})" for line, key in keys)
+        sections: dict[str, list[tuple[int, str]]] = {}
+        for line, key in keys:
+            section, _, last = key.rpartition(".")
+            sections.setdefault(section, []).append((line, last))
+        listed = "; ".join(
+            f"{section}: {', '.join(last for _, last in found)} (line {found[0][0]})"
+            for section, found in sections.items()
+        )
         stdout_console.print(f"  {number}. {title}: {listed}", soft_wrap=True)
 
 

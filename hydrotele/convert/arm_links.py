@@ -7,19 +7,22 @@ raises the outboard end, and at angle 0 each of these links points forward. Henc
 """
 
 import math
+import os
 import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from hydrotele.convert.robot_description import Inertial, Robot, RobotLink, rotation_about
-from hydrotele.convert.shapes import Shape
+from hydrotele.convert.shapes import Shape, distance_outside_hull
 from hydrotele.core.errors import InputError
 
 _UP = np.array([0.0, 0.0, 1.0])
-_PARALLEL = 0.95  # cosine above which two axes count as parallel
+_PARALLEL = 0.999  # cosine above which two axes count as parallel: 2.5 deg
+_AXIS_ROUNDING = 2.0e-3  # components of an axis that are smaller are rounding errors of angles such as 1.57
 _FRAME_SIZE = 0.02  # m, a link without mass and without a larger shape is only a frame
 _FRAME_MASS = 0.01  # kg
+_MAX_PIN_GAP = 0.1  # of the size of a link, from a rod's eye to the hull of the link that it moves
 _CYLINDER_NAMES = re.compile(r"cyl|piston|rod(?!a)|ram\b|jack|barrel", re.IGNORECASE)
 
 
@@ -149,11 +152,20 @@ def arrange_links(robot: Robot) -> MachineTree:
     if not path:
         raise InputError(robot.name, "has no joint that moves; a machine needs at least one")
     below = _descendants(robot, path[-1])
-    for name, link in robot.links.items():
-        if link.kind != "fixed" and name not in locked | skipped | set(path) | below:
-            locked.add(name)
-            notes.append(f"joint {link.joint} is not part of the arm; it is locked at 0")
+    others = [
+        name for name, link in robot.links.items()
+        if link.kind != "fixed" and name not in locked | skipped | set(path) | below
+    ]  # fmt: skip
+    locked |= set(others)
+    if others:
+        notes.append(f"not part of the arm and locked at 0: {', '.join(robot.links[name].joint for name in others)}")
     return _Arranger(robot, locked, skipped, path, notes).arrange(branches)
+
+
+def _common_prefix(names: list[str]) -> str:
+    """Return the prefix that all names share, up to the last `/` or `_` in it, such as that of a namespace."""
+    found = re.match(r".*[/_]", os.path.commonprefix(names))
+    return found.group() if found and len(names) > 1 else ""
 
 
 def _frames_and_followers(robot: Robot, notes: list[str]) -> set[str]:
@@ -220,6 +232,11 @@ def _descendants(robot: Robot, root: str) -> set[str]:
     return found - {root}
 
 
+def _clean_axis(axis: np.ndarray) -> np.ndarray:
+    cleaned = np.where(np.abs(axis) < _AXIS_ROUNDING, 0.0, axis)
+    return cleaned / np.linalg.norm(cleaned)
+
+
 class _Arranger:
     """Computes roles, reference pose and frames of one robot."""
 
@@ -229,6 +246,8 @@ class _Arranger:
         self.signs: dict[str, float] = {}
         self.roles: dict[str, str] = {}
         self.names: dict[str, str] = {}  # names of links in the machine
+        moving = [link for name, link in robot.links.items() if self.moves(name)]
+        self.prefixes = _common_prefix([link.name for link in moving]), _common_prefix([link.joint for link in moving])
         self.base = np.eye(3)  # orientation of the robot's root in the world
         self.rotations, self.origins = self._forward_kinematics()
 
@@ -276,7 +295,7 @@ class _Arranger:
             self.roles[path[0]] = "swing"
             self.signs[path[0]] = math.copysign(1.0, self.world_axis(path[0]) @ _UP)
             rest = path[1:]
-        level = [n for n in rest if links[n].kind == "hinge" and abs(self.world_axis(n) @ _UP) < 1.0 - _PARALLEL]
+        level = [n for n in rest if links[n].kind == "hinge" and abs(self.world_axis(n) @ _UP) < 0.05]
         plane: list[str] = []
         if level:
             way = self.world_axis(level[0])
@@ -372,11 +391,10 @@ class _Arranger:
         if pin is None:
             pin = self._rod_eye(tube, rod, rotations, origins)
             points = [shape.points() @ rotations[moved].T + origins[moved] for shape in links[moved].visuals]
-            cloud = np.vstack(points) if points else None
-            if cloud is not None and np.linalg.norm(cloud - pin, axis=1).min() > 0.3:
+            cloud = np.vstack(points) if points else np.zeros((0, 3))
+            if distance_outside_hull(cloud, pin) > _MAX_PIN_GAP * float(np.ptp(cloud, axis=0).max(initial=0.0)):
                 self.notes.append(f"rod {rod} does not reach {moved} at joint angle 0; its cylinder is estimated")
                 return
-        joint_name = moved
         limits = links[rod].range
         base_place = origins[tube]
         base_rotation = self.rotations[base] if base else self.base
@@ -384,7 +402,7 @@ class _Arranger:
         base_pin = base_rotation @ (base_zero[0].T @ (base_place - base_zero[1]))
         rod_pin = self.rotations[moved] @ (rotations[moved].T @ (pin - origins[moved]))
         stroke = limits[1] - limits[0] if limits else None
-        stated[joint_name] = StatedCylinder(joint_name, base or "world", base_pin, rod_pin, stroke)
+        stated[moved] = StatedCylinder(moved, base or "world", base_pin, rod_pin, stroke)
 
     def _rod_eye(self, tube: str, rod: str, rotations, origins) -> np.ndarray:
         """Return the far end of a rod's shape, less its radius, or its frame's origin without a shape."""
@@ -444,8 +462,8 @@ class _Arranger:
     def _add_moving_link(self, name, names, taken, joints, built, ends) -> None:
         link: RobotLink = self.robot.links[name]
         above = self._carrier(link.parent)
-        names[name] = machine_name(name, taken, r"_?(link|frame|body)$")
-        joint = machine_name(link.joint, joints, r"_?(joint|axis)$")
+        names[name] = machine_name(name.removeprefix(self.prefixes[0]), taken, r"_(link|frame)$")
+        joint = machine_name(link.joint.removeprefix(self.prefixes[1]), joints, r"_(joint|axis)$")
         origin = self.origins[above] if above else np.zeros(3)
         sign, offset = self.signs.get(name, 1.0), self.reference.get(name, 0.0)
         limits = link.range
@@ -453,6 +471,6 @@ class _Arranger:
             limits = tuple(sorted((sign * (limits[0] - offset), sign * (limits[1] - offset))))
         built[names[name]] = MovingLink(
             names[name], joint, names[above] if above else "world", self.origins[name] - origin, link.kind,
-            sign * self.world_axis(name), limits, self.roles[name], link.joint, sign, offset,
+            _clean_axis(sign * self.world_axis(name)), limits, self.roles[name], link.joint, sign, offset,
             ends.get(name, self.origins[name]) - self.origins[name],
         )  # fmt: skip

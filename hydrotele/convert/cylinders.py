@@ -96,16 +96,19 @@ def _surface_points(shape) -> np.ndarray:
     return np.vstack([start + (stop - start) * share for share in np.linspace(0.0, 0.9, 10)])
 
 
-def place_on_hinge(parent: MovingLink | None, link: MovingLink, boom_length: float) -> PlacedCylinder | None:
+def place_on_hinge(
+    parent: MovingLink | None, link: MovingLink, boom_length: float, count: int
+) -> PlacedCylinder | None:
     """Place a cylinder on a hinge of the arm's plane.
 
-    A boom is lifted from below: the long arm is on the boom, at half its height. Other links are
-    moved from above the link before, and the long arm is there, on its upper side.
+    A boom is lifted from below: the long arm is on the boom, at half its height for a cylinder on
+    each side, otherwise below it. Other links are moved from above the link before, and the long arm is there, on its upper side.
 
     Args:
         parent: link that carries the hinge, None for the base.
         link: link that the hinge moves.
         boom_length: length of the longest arm link [m].
+        count: number of parallel cylinders.
 
     Returns:
         The cylinder, or None if the range of the hinge is too large for it.
@@ -117,7 +120,8 @@ def place_on_hinge(parent: MovingLink | None, link: MovingLink, boom_length: flo
     if link.role == "boom":
         long = min(long, 0.6 * link.length) if link.length > 0.2 * boom_length else long
         heights = _slice_heights(link, long, 0.06 * boom_length)
-        height = 0.5 * sum(heights) if heights else 0.0
+        below = (heights[0] if heights else -0.035 * boom_length) - 0.015 * boom_length
+        height = below if count == 1 else 0.5 * sum(heights) if heights else 0.0
         rod = np.array([long, 0.0, height])
         base = _ARM_RATIO * long * _direction(math.atan2(height, long) + middle - _APEX)
     else:
@@ -172,8 +176,10 @@ def place_on_slide(parent: MovingLink | None, link: MovingLink, boom_length: flo
     side *= 0.06 * boom_length / np.linalg.norm(side)
     travel = high - low
     closed = 1.2 * travel + 0.04 * boom_length
-    rod = side + 0.0 * link.axis
     base = side - (closed - low - _STROKE_MARGIN * travel) * link.axis
+    behind = -float((base + link.position) @ link.axis) if parent is not None else 0.0
+    forward = min(max(behind, 0.0), max(link.length, 0.1 * travel)) * link.axis  # so that the base pin is on the parent
+    rod, base = side + forward, base + forward
     placed = _finish(link, base, rod, "estimated", None)
     assert placed is not None
     return placed

@@ -23,7 +23,7 @@ _STEEL = 7850.0  # kg/m^3
 _MIN_DENSITY = 60.0  # kg/m^3 of the convex hull: thin plates around air
 _MAX_GYRATION_RATIO = 0.6  # largest radius of gyration over the longest dimension; 0.58 if all mass is at the ends
 _MIN_GYRATION_RATIO = 0.02
-_MAX_CLASS_RATIO = 8.0  # a mass that differs more from its class is not believed without a shape
+_MAX_CLASS_RATIO = 4.0  # a mass that differs more from its class is not believed without a shape
 
 
 class BodyEstimate(NamedTuple):
@@ -91,10 +91,10 @@ def estimate_body(link: MovingLink, longest: float) -> BodyEstimate:
         return BodyEstimate(stated.mass, stated.centre, _make_consistent(moments), "")
     mass = _class_mass(link, longest)
     if solid is None:
-        half = max(0.5 * link.length, 0.1 * longest)
-        solid = convex_solid(_bar_points(link, half))
+        solid = convex_solid(_class_points(link, longest))
         assert solid
-    mass = min(mass, 0.6 * _STEEL * solid.volume)
+    else:
+        mass = min(mass, 0.6 * _STEEL * solid.volume)
     centre = solid.centre.copy()
     moments = np.diag(solid.inertia) * mass / solid.volume
     return BodyEstimate(mass, centre, _make_consistent(moments), reason)
@@ -116,10 +116,13 @@ def _solid(link: MovingLink) -> Solid | None:
     return convex_solid(np.vstack([shape.points() for shape in shapes])) if shapes else None
 
 
-def _bar_points(link: MovingLink, half: float) -> np.ndarray:
-    """Return the corners (8, 3) of a bar from a joint to the end of its link."""
-    end = link.end if link.length > 1e-3 else np.array([2.0 * half, 0.0, 0.0])
-    wide = 0.08 * max(float(np.linalg.norm(end)), half)
+def _class_points(link: MovingLink, longest: float) -> np.ndarray:
+    """Return the corners (8, 3) of a typical link without shapes: the upper structure, or a bar to the link's end."""
+    if link.role == "swing":
+        low, high = np.array([-0.45, -0.25, 0.0]) * longest, np.array([0.2, 0.25, 0.35]) * longest
+        return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    end = link.end if link.length > 0.05 * longest else np.array([0.1 * longest, 0.0, 0.0])
+    wide = 0.08 * float(np.linalg.norm(end))
     corners = [np.array([0.0, y, z]) for y in (-wide, wide) for z in (-wide, wide)]
     sides = corners if abs(end[0]) >= abs(end[2]) else [corner[[2, 1, 0]] for corner in corners]
     return np.array(sides + [side + end for side in sides])

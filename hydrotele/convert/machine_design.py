@@ -111,7 +111,7 @@ def design_machine(tree: MachineTree, where: object) -> MachineDesign:
         )
     design = MachineDesign(tree, longest, bodies, drives, hydraulics, {}, notes)
     design.home = _choose_home(design)
-    _enlarge_weak_cylinders(design)
+    _enlarge_weak_drives(design)
     for name, body in bodies.items():
         if body.reason:
             notes.append(f"mass and inertia of {name} replaced by an estimate, {body.mass:.3g} kg: {body.reason}")
@@ -163,7 +163,7 @@ def _choose_drive(
         if link.role == "tool" and parent and parent.role in ("stick", "plane"):
             if four_bar := place_four_bar(parent, link, longest):
                 return Drive(four_bar.cylinder, four_bar, area)
-        if cylinder := place_on_hinge(parent, link, longest):
+        if cylinder := place_on_hinge(parent, link, longest, count):
             return Drive(cylinder, area=area, count=count)
         reason = "has no limits" if link.range is None else f"turns by {math.degrees(np.ptp(link.range)):.0f} deg"
         notes.append(f"joint {link.source_joint} {reason}, too much for a cylinder; it gets a motor")
@@ -232,27 +232,30 @@ def _choose_home(design: MachineDesign) -> dict[str, float]:
     return home
 
 
-def _enlarge_weak_cylinders(design: MachineDesign) -> None:
-    """Enlarge estimated areas of hinges so that they hold the stretched arm with a fraction of the relief pressure."""
+def _enlarge_weak_drives(design: MachineDesign) -> None:
+    """Enlarge estimated areas and motors so that they hold the stretched arm with a fraction of the relief pressure."""
     tree = design.tree
-    stretched = {link.joint: design.home[link.joint] if link not in tree.plane_links else 0.0 for link in tree.links.values()}
+    stretched = dict(design.home)
     for link in tree.plane_links:
+        low, high = link.range or (0.0, 0.0)
+        stretched[link.joint] = min(max(0.0, low), high)
+    poses = joint_poses(tree, stretched)
+    pressure = _HOLDING_PRESSURE_FRACTION * design.hydraulics.relief_pressure
+    for link in tree.links.values():
         drive = design.drives.get(link.joint)
-        if drive is None or drive.cylinder is None:
+        if drive is None or link.kind == "slide" or link.role == "swing":
             continue
-        for other in tree.plane_links:
-            low, high = other.range or (0.0, 0.0)
-            stretched[other.joint] = min(max(0.0, low), high)
-        poses = joint_poses(tree, stretched)
         pivot, torque = poses[link.name][1], 0.0
         for name in _links_beyond(tree, link.name):
             rotation, origin = poses[name]
             body = design.bodies[name]
             torque += body.mass * _GRAVITY * float(np.linalg.norm((origin + rotation @ body.centre - pivot)[:2]))
-        pressure = _HOLDING_PRESSURE_FRACTION * design.hydraulics.relief_pressure
-        needed = torque / (pressure * max(_typical_lever(link, drive.cylinder), 1e-3))
-        area = min(max(drive.area, needed), _MAX_ENLARGEMENT * drive.area)
-        design.drives[link.joint] = drive._replace(area=area)
+        if drive.cylinder:
+            needed = torque / (pressure * max(_typical_lever(link, drive.cylinder), 1e-3))
+            enlarged = drive._replace(area=min(max(drive.area, needed), _MAX_ENLARGEMENT * drive.area))
+        else:
+            enlarged = drive._replace(displacement=max(drive.displacement, torque / pressure))
+        design.drives[link.joint] = enlarged
 
 
 def _typical_lever(link: MovingLink, cylinder: PlacedCylinder) -> float:

@@ -92,7 +92,7 @@ def _machine_yaml(name: str, source: str, design: MachineDesign) -> str:
         tool = next(link.name for link in design.tree.links.values() if link.joint == joint)
         lines += [
             f"  {joint}_coupler_pin: {{a: {{link: {joint}_coupler, position: {_place([four_bar.coupler_length, 0, 0])}}},"
-            f" b: {{link: {tool}, position: {_place(four_bar.tool_pin)}}}}}",
+            f" b: {{link: {tool}, position: {_place(four_bar.tool_pin)}}}}}   {mark}",
         ]
     hydraulics = design.hydraulics
     lines += [
@@ -402,6 +402,9 @@ class _MjcfWriter:
         pins = self._pins(link.name)
         shapes = [_bar(np.zeros(3), end, 0.035 * length) for end in ends if np.linalg.norm(end) > 0.02 * length]
         shapes += [_bar(np.zeros(3), pin, 0.02 * length) for pin, _ in pins if np.linalg.norm(pin) > 0.04 * length]
+        if link.kind == "slide" and link.range:
+            back = -(link.range[1] - link.range[0] + 0.1 * length) * link.axis
+            shapes.append(_bar(back, np.zeros(3), 0.025 * length))
         if link.role == "swing":
             half = (0.3 * length, 0.2 * length, 0.08 * length)
             shapes.append(Shape("box", half, position=np.array([-0.15 * length, 0.0, 0.09 * length]), rgba=()))

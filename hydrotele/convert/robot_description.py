@@ -155,7 +155,9 @@ class _UrdfReader:
         self._mark_undriven(root, links)
         ordered = self._order(links)
         if self.missing:
-            self.notes.append(f"meshes not found, drawn as bars: {', '.join(dict.fromkeys(self.missing))}")
+            names = list(dict.fromkeys(self.missing))
+            more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+            self.notes.append(f"meshes not found, drawn as bars: {', '.join(names[:3])}{more}")
         return Robot(root.get("name") or self.path.stem, ordered, [], self.notes)
 
     def _read_link(self, element, name: str, colours: dict) -> RobotLink:

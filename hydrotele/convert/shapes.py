@@ -108,6 +108,18 @@ def convex_solid(points: np.ndarray) -> Solid | None:
     return Solid(volume, centre + middle, inertia, vertices, faces)
 
 
+def distance_outside_hull(points: np.ndarray, place: np.ndarray) -> float:
+    """Return how far a place (3,) is beyond the nearest violated face of the hull of points (n, 3); 0 inside [m].
+
+    0 as well if the points have no hull.
+    """
+    try:
+        equations = ConvexHull(points).equations
+    except (QhullError, ValueError, IndexError):
+        return 0.0
+    return max(0.0, float((equations[:, :3] @ place + equations[:, 3]).max()))
+
+
 def read_mesh(path: Path, scale: np.ndarray, rgba: tuple[float, ...] | None) -> list[Shape]:
     """Read a mesh file (STL, OBJ or DAE) as one shape per colour.
 
