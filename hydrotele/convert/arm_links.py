@@ -144,10 +144,10 @@ def arrange_links(robot: Robot) -> MachineTree:
     Raises:
         InputError: no joint of the robot can move.
     """
-    notes = list(robot.notes)
-    locked = _frames_and_followers(robot, notes)
+    locked = _frames_and_followers(robot, notes := robot.notes)
     branches = _cylinder_branches(robot, locked)
     skipped = {name for tube, rod in branches for name in (tube, rod)}
+    skipped |= _mark_moved_by_cylinders(robot, branches)
     path = _longest_path(robot, locked | skipped)
     if not path:
         raise InputError(robot.name, "has no joint that moves; a machine needs at least one")
@@ -204,6 +204,30 @@ def _cylinder_branches(robot: Robot, locked: set[str]) -> list[tuple[str, str]]:
         if not moving and (rod in closed or _CYLINDER_NAMES.search(words)):
             branches.append((tube.name, rod))
     return branches
+
+
+def _mark_moved_by_cylinders(robot: Robot, branches: list[tuple[str, str]]) -> set[str]:
+    """Mark the links that rods are closed to as driven, and return the bars between a rod and a tool.
+
+    Bars are links that carry nothing but other bars, and are closed to the rod at one end and to
+    another link at the other: rocker and coupler of a four-bar linkage, which is estimated anew.
+    """
+    others: dict[str, set[str]] = {}
+    for closure in robot.closures:
+        others.setdefault(closure.link, set()).add(closure.other)
+        others.setdefault(closure.other, set()).add(closure.link)
+    bars: set[str] = set()
+    for _, rod in branches:
+        for end in others.get(rod, ()):
+            closed = {end} | _descendants(robot, end)
+            beyond = set().union(*(others.get(name, set()) for name in closed)) - closed - {rod}
+            beyond -= {name for branch in branches for name in branch}
+            if beyond:
+                bars |= closed
+                robot.notes.append(f"linkage {', '.join(sorted(closed))} of a cylinder is estimated anew")
+            for name in beyond or {end}:
+                robot.links[name].is_driven = True
+    return bars
 
 
 def _longest_path(robot: Robot, excluded: set[str]) -> list[str]:
@@ -384,6 +408,8 @@ class _Arranger:
             for rod_end, far, far_place in ((one, other, other_place), (other, one, place)):
                 if rod_end == rod:
                     pin, after = origins[far] + rotations[far] @ far_place, [n for n in after if n == self._carrier(far)]
+        if pin is not None and not after:
+            return  # of a four-bar linkage, which is estimated anew
         if not after or self.roles.get(after[0]) == "swing":
             self.notes.append(f"cylinder {tube} moves no joint of the arm; it is left out")
             return

@@ -335,7 +335,8 @@ def _read_mjcf_robot(path: Path) -> Robot:
             if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
                 link.kind = "hinge" if kind == mujoco.mjtJoint.mjJNT_HINGE else "slide"
                 link.axis = model.jnt_axis[joint].copy()
-                link.range = tuple(model.jnt_range[joint]) if model.jnt_limited[joint] else None
+                limits = model.jnt_range[joint]  # also of a joint whose cylinder is limited in its place
+                link.range = (float(limits[0]), float(limits[1])) if limits[0] < limits[1] else None
                 link.is_driven = joint in actuated or not actuated
             else:
                 notes.append(f"joint {link.joint} is free or a ball; it is locked")
