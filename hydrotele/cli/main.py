@@ -608,8 +608,8 @@ def validate(
     """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
     Values of a machine file on lines with the comment "# estimate" are listed in the order in which
-    they should be replaced. Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
-    next to the log, or that of its metadata.
+    they should be replaced. Logs are checked as by gap, with the column names and ranges of
+    --machine. Default: the machine next to the log, or that of its metadata.
     """
     from hydrotele.cli.validate_command import LogMachine, validate_files
 

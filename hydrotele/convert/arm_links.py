@@ -1,6 +1,6 @@
 """Arrange the links of a robot as those of a machine: moving links, arm, frames and angles.
 
-A machine's link has no orientation of its own: at machine angle 0 all frames are parallel to the
+A link of a machine has a position but no orientation: at machine angle 0 all frames are parallel to the
 world, z up and x forward. Joints of the arm's plane have the axis -y, so that a positive angle
 raises the outboard end, and at angle 0 each of these links points forward. Hence a machine angle is
 `sign * (robot angle - offset)`.
@@ -407,7 +407,10 @@ class _Arranger:
         for one, place, other, other_place in self.robot.closures:
             for rod_end, far, far_place in ((one, other, other_place), (other, one, place)):
                 if rod_end == rod:
-                    pin, after = origins[far] + rotations[far] @ far_place, [n for n in after if n == self._carrier(far)]
+                    pin, after = (
+                        origins[far] + rotations[far] @ far_place,
+                        [n for n in after if n == self._carrier(far)],
+                    )
         if pin is not None and not after:
             return  # of a four-bar linkage, which is estimated anew
         if not after or self.roles.get(after[0]) == "swing":
@@ -462,13 +465,13 @@ class _Arranger:
                 self._add_moving_link(name, names, taken, joints, built, ends)
             if carrier is None:
                 rotation, origin = self.rotations[name], self.origins[name]
-                base_visuals += [shape.moved(rotation, origin) for shape in link.visuals]
-                base_collisions += [shape.moved(rotation, origin) for shape in link.collisions]
+                base_visuals += [shape.transform(rotation, origin) for shape in link.visuals]
+                base_collisions += [shape.transform(rotation, origin) for shape in link.collisions]
                 continue
             target, rotation = built[names[carrier]], self.rotations[name]
             origin = self.origins[name] - self.origins[carrier]
-            target.visuals += [shape.moved(rotation, origin) for shape in link.visuals]
-            target.collisions += [shape.moved(rotation, origin) for shape in link.collisions]
+            target.visuals += [shape.transform(rotation, origin) for shape in link.visuals]
+            target.collisions += [shape.transform(rotation, origin) for shape in link.collisions]
             if link.inertial is not None:
                 mass, centre, inertia = link.inertial
                 target.inertials.append(Inertial(mass, rotation @ centre + origin, rotation @ inertia @ rotation.T))
@@ -494,7 +497,8 @@ class _Arranger:
         sign, offset = self.signs.get(name, 1.0), self.reference.get(name, 0.0)
         limits = link.range
         if limits:
-            limits = tuple(sorted((sign * (limits[0] - offset), sign * (limits[1] - offset))))
+            low, high = sorted(sign * (limit - offset) for limit in limits)
+            limits = (low, high)
         built[names[name]] = MovingLink(
             names[name], joint, names[above] if above else "world", self.origins[name] - origin, link.kind,
             _clean_axis(sign * self.world_axis(name)), limits, self.roles[name], link.joint, sign, offset,

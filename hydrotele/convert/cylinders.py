@@ -102,7 +102,8 @@ def place_on_hinge(
     """Place a cylinder on a hinge of the arm's plane.
 
     A boom is lifted from below: the long arm is on the boom, at half its height for a cylinder on
-    each side, otherwise below it. Other links are moved from above the link before, and the long arm is there, on its upper side.
+    each side, otherwise below it. Other links are moved from above the link before, and the long arm
+    is there, on its upper side.
 
     Args:
         parent: link that carries the hinge, None for the base.
@@ -256,7 +257,8 @@ def place_four_bar(parent: MovingLink, link: MovingLink, boom_length: float) -> 
         tool = arm * scale * _direction(middle - 0.5 * (low + high))
         return FourBar(
             output_pivot=(pivot[0], pivot[2]), rocker_pivot=(place[0], place[2]), cylinder_base=(base[0], base[2]),
-            rocker=rocker * scale, coupler=coupler * scale, output_arm=(tool[0], tool[2]), working_angle=0.5 * (low + high),
+            rocker=rocker * scale, coupler=coupler * scale, output_arm=(tool[0], tool[2]),
+            working_angle=0.5 * (low + high),
         )  # fmt: skip
 
     def lengths(values: np.ndarray) -> np.ndarray | None:
@@ -293,7 +295,9 @@ def place_four_bar(parent: MovingLink, link: MovingLink, boom_length: float) -> 
         return None
     ground, way, rocker, coupler, arm, middle = best.x
     lever = float(np.abs(steps).min()) / (angles[1] - angles[0])
-    cylinder = PlacedCylinder(parent.name, base, "", np.array([rocker * scale, 0, 0]), closed, stroke, "estimated", lever)
+    cylinder = PlacedCylinder(
+        parent.name, base, "", np.array([rocker * scale, 0, 0]), closed, stroke, "estimated", lever
+    )
     return PlacedFourBar(
         cylinder, pivot + ground * scale * _direction(way), np.array([rocker * scale, 0.0, 0.0]), coupler * scale,
         arm * scale * _direction(middle - 0.5 * (low + high)), build(best.x),
@@ -307,7 +311,8 @@ def _loop_violation(values: np.ndarray, low: float, high: float) -> float:
     for q in np.linspace(low, high, 9):
         arm_direction = middle - 0.5 * (low + high) + q
         gap = math.hypot(
-            arm * math.cos(arm_direction) - ground * math.cos(way), arm * math.sin(arm_direction) - ground * math.sin(way)
+            arm * math.cos(arm_direction) - ground * math.cos(way),
+            arm * math.sin(arm_direction) - ground * math.sin(way),
         )
         cosine = (rocker**2 + coupler**2 - gap**2) / (2.0 * rocker * coupler)
         worst = max(worst, abs(cosine) - math.cos(math.radians(15.0)))

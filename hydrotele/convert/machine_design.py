@@ -130,8 +130,8 @@ def _stand_on_ground(tree: MachineTree, longest: float) -> None:
     for link in first:
         link.position = link.position + [0.0, 0.0, shift]
     lift = np.array([0.0, 0.0, shift])
-    tree.base_visuals = [shape.moved(np.eye(3), lift) for shape in tree.base_visuals]
-    tree.base_collisions = [shape.moved(np.eye(3), lift) for shape in tree.base_collisions]
+    tree.base_visuals = [shape.transform(np.eye(3), lift) for shape in tree.base_visuals]
+    tree.base_collisions = [shape.transform(np.eye(3), lift) for shape in tree.base_collisions]
     for cylinder in tree.cylinders.values():
         if cylinder.base_link == "world":
             cylinder.base_pin = cylinder.base_pin + lift
@@ -196,7 +196,10 @@ def _lowest_point(design: MachineDesign, angles: dict[str, float]) -> float:
 
 
 def _choose_home(design: MachineDesign) -> dict[str, float]:
-    """Return a working pose: boom 25 deg, stick -90 deg, others in the middle; raised until nothing touches the ground."""
+    """Return a working pose: boom 25 deg, stick -90 deg, others in the middle of their ranges.
+
+    Boom and stick are raised until nothing touches the ground.
+    """
     tree = design.tree
     home: dict[str, float] = {}
 

@@ -1,5 +1,6 @@
 """Write the folder of a new machine: machine.yaml, MJCF, meshes and a scenario that moves every axis."""
 
+import json
 import math
 from pathlib import Path
 
@@ -18,6 +19,7 @@ _MAX_HULL_POINTS = 200
 _YELLOW, _DARK, _CHROME = (0.95, 0.66, 0.06, 1.0), (0.2, 0.2, 0.21, 1.0), (0.86, 0.88, 0.9, 1.0)
 _FRICTION_PRESSURE = 0.15e6  # Pa: seal friction over head-side area, CAT 325 0.146e6, EC20 0.150e6
 _VISCOUS_PRESSURE = 0.4e6  # Pa s/m: CAT 325 0.29e6, EC20 0.9e6
+_PASSIVE_DAMPING = 60.0  # N m s/rad, grapple link of the CAT 215 (boom of 5.2 m)
 _SCENARIO = "moves.yaml"
 
 
@@ -61,15 +63,16 @@ def _machine_yaml(name: str, source: str, design: MachineDesign) -> str:
     mark = f"# {ESTIMATE_MARK}"
     scale = design.length / 5.2
     lines = [
-        f"# {name}, made from {source} by `hydrotele new machine`. SI, radians; a key may carry another unit as its suffix.",
-        f'# A line marked "{ESTIMATE_MARK}" has a value typical of the machine class. Replace the value and remove the mark;',
+        f"# {name}, made from {source} by `hydrotele new machine`.",
+        "# SI, radians; a key may carry another unit as its suffix.",
+        f'# A line marked "{ESTIMATE_MARK}" has a value typical of the machine class. Replace it and remove the mark;',
         f"# `hydrotele validate ./{name}` lists the marked lines in the order of their effect.",
         "# Frames: z up, x forward; angles of boom, stick and tool positive = outboard end up.",
         "# Changed or assumed when the file was read:",
         *(f"#   {note}" for note in design.notes),
         f"name: {name}",
         f"description: {name}, from a robot description",
-        f"source: {source}; marked values are typical of the class",
+        f"source: {json.dumps(source)}",
         f"mjcf: {name}.xml",
         "",
         "links:",
@@ -91,7 +94,8 @@ def _machine_yaml(name: str, source: str, design: MachineDesign) -> str:
         assert four_bar
         tool = next(link.name for link in design.tree.links.values() if link.joint == joint)
         lines += [
-            f"  {joint}_coupler_pin: {{a: {{link: {joint}_coupler, position: {_place([four_bar.coupler_length, 0, 0])}}},"
+            f"  {joint}_coupler_pin: {{a: {{link: {joint}_coupler, "
+            f"position: {_place([four_bar.coupler_length, 0, 0])}}},"
             f" b: {{link: {tool}, position: {_place(four_bar.tool_pin)}}}}}   {mark}",
         ]
     hydraulics = design.hydraulics
@@ -107,7 +111,7 @@ def _machine_yaml(name: str, source: str, design: MachineDesign) -> str:
         "sensors:",
         f"  typical: {{rate: 50, angle: {{accuracy_deg: 0.2}}, pressure: {{accuracy_bar: 2}}}}   {mark}",
         "",
-        "uncertainty: {flow_table: 1.0, delay: 0.05, linkage: 0.15}   # standard deviations of logarithms, of the delay [s]",
+        "uncertainty: {flow_table: 1.0, delay: 0.05, linkage: 0.15}   # standard deviations, the delay in s",
         "",
         f"home: {{{', '.join(f'{joint}: {value:g}' for joint, value in _home(design).items())}}}",
     ]
@@ -122,11 +126,19 @@ def _link_lines(link: MovingLink, design: MachineDesign, mark: str) -> list[str]
     angle = f"{link.joint}" if link.sign > 0 else f"-{link.joint}"
     offset = math.degrees(link.offset)
     relation = angle if abs(offset) < 1e-3 else f"{offset:.4f} deg {'+' if link.sign > 0 else '-'} {link.joint}"
-    lines = [f"  {link.name}:   # {link.source_joint} of the file = {relation}", f"    position: {_place(link.position)}"]
+    lines = [
+        f"  {link.name}:   # {link.source_joint} of the file = {relation}",
+        f"    position: {_place(link.position)}",
+    ]
+    values = []
     if link.range:
         hinge = link.kind == "hinge"
         limits = [math.degrees(value) if hinge else value for value in link.range]
-        lines += [f"    joint: {{range{'_deg' if hinge else ''}: {_place(limits)}{', damping: 60' if link.role == 'passive' else ''}}}"]
+        values += [f"range{'_deg' if hinge else ''}: {_place(limits)}"]
+    if link.role == "passive":
+        values += [f"damping: {_number(_PASSIVE_DAMPING * (design.length / 5.2) ** 3, 2)}"]
+    if values:
+        lines += [f"    joint: {{{', '.join(values)}}}{f'   {mark}' if link.role == 'passive' else ''}"]
     return [
         *lines,
         f"    mass: {_number(body.mass)}{reason}",
@@ -175,7 +187,8 @@ def _cylinder_lines(link: MovingLink, drive: Drive, mark: str) -> list[str]:
 
     def part(mass: float) -> str:
         across = mass * closed**2 / 12.0
-        return f"{{mass: {_number(mass, 3)}, com: {_number(0.48 * closed, 3)}, inertia: {_numbers([mass * bore**2 / 3, across, across], 3)}}}"
+        inertia = _numbers([mass * bore**2 / 3.0, across, across], 3)
+        return f"{{mass: {_number(mass, 3)}, com: {_number(0.48 * closed, 3)}, inertia: {inertia}}}"
 
     lines = [f"  {link.joint}:{number}", f"    joint: {link.joint}"]
     if drive.four_bar:
@@ -258,7 +271,9 @@ def _scenario_yaml(name: str, design: MachineDesign) -> str:
         away = 0.2 * (high - low)
         target = home + away if home + away < high - 0.05 * (high - low) else home - away
         duration = 4.0
-        points += [f"    - {{duration: {duration:g}, joints: {{{link.joint}: {value:.4g}}}}}" for value in (target, home)]
+        points += [
+            f"    - {{duration: {duration:g}, joints: {{{link.joint}: {value:.4g}}}}}" for value in (target, home)
+        ]
     total = 2.0 + 4.0 * len(points)
     return "\n".join([
         "name: moves",
@@ -327,7 +342,9 @@ class _MjcfWriter:
         poses = joint_poses(self.design.tree, self.design.home)
         places = [origin for _, origin in poses.values()]
         places += [poses[link.name][1] + poses[link.name][0] @ link.end for link in self.design.tree.links.values()]
-        places += [place + [0, 0, self.design.length * 0.2] for place in places] + [np.array([-self.design.length * 0.4, 0, 0])]
+        places += [place + [0, 0, self.design.length * 0.2] for place in places] + [
+            np.array([-self.design.length * 0.4, 0, 0])
+        ]
         cloud = np.array(places)
         low, high = cloud.min(axis=0), cloud.max(axis=0)
         return 0.5 * (low + high), max(1.15 * float((high - low).max()), 0.5)
@@ -359,7 +376,7 @@ class _MjcfWriter:
                 count = {"box": 3, "sphere": 1}.get(shape.kind, 2)
                 size = " ".join(f"{max(value, 1e-4):.5g}" for value in shape.size[:count])
                 lines.append(
-                    f'{indent}<geom type="{shape.kind}" size="{size}" pos="{_spaced(shape.position)}"'
+                    f'{indent}<geom type="{shape.kind}" size="{size}" pos="{_join_numbers(shape.position)}"'
                     f' quat="{_quaternion(shape.rotation)}" rgba="{rgba}"/>'
                 )
         return lines
@@ -483,8 +500,13 @@ class _MjcfWriter:
                 start, stop = np.array([0.0, y, 0.0]), np.array([0.92 * closed, y, 0.0])
                 lines += [_cylinder(start, stop, radius, _YELLOW, inner)]
                 lines += [_cylinder(stop - [0.06 * closed, 0, 0], stop, 1.12 * radius, _DARK, inner)]
-                lines += [_cylinder(start - [0, 1.1 * radius, 0], start + [0, 1.1 * radius, 0], 1.15 * radius, _DARK, inner)]
-            lines += [f'{inner}<body name="{joint}_rod">', f'{inner} <joint name="{joint}_rod" type="slide" axis="1 0 0"/>']
+                lines += [
+                    _cylinder(start - [0, 1.1 * radius, 0], start + [0, 1.1 * radius, 0], 1.15 * radius, _DARK, inner)
+                ]
+            lines += [
+                f'{inner}<body name="{joint}_rod">',
+                f'{inner} <joint name="{joint}_rod" type="slide" axis="1 0 0"/>',
+            ]
             for y in sides:
                 eye = np.array([0.0, y, 0.0])
                 lines += [_cylinder(eye - [cylinder.stroke + 0.05 * closed, 0, 0], eye, rod, _CHROME, inner + " ")]
@@ -502,9 +524,15 @@ class _MjcfWriter:
         lines += [f'{inner}<joint name="{joint}_rocker" type="hinge" axis="{axis}"/>']
         for y in (-wide, wide):
             lines += [_capsule(np.array([0, y, 0]), four_bar.coupler_pin + [0, y, 0], thick, _YELLOW, inner)]
-        lines += [f'{inner}<body name="{joint}_coupler">', f'{inner} <joint name="{joint}_coupler" type="hinge" axis="{axis}"/>']
+        lines += [
+            f'{inner}<body name="{joint}_coupler">',
+            f'{inner} <joint name="{joint}_coupler" type="hinge" axis="{axis}"/>',
+        ]
         end = np.array([four_bar.coupler_length, 0.0, 0.0])
-        lines += [_capsule(np.array([0, y, 0.0]), end + [0, y, 0], 0.9 * thick, _DARK, inner + " ") for y in (-0.5 * wide, 0.5 * wide)]
+        lines += [
+            _capsule(np.array([0, y, 0.0]), end + [0, y, 0], 0.9 * thick, _DARK, inner + " ")
+            for y in (-0.5 * wide, 0.5 * wide)
+        ]
         return [*lines, f"{inner}</body>", f"{indent}</body>"]
 
 
@@ -521,7 +549,8 @@ def _bar(start: np.ndarray, stop: np.ndarray, half: float) -> Shape:
 
 def _geom(kind: str, start, stop, radius: float, rgba, indent: str) -> str:
     colour = " ".join(f"{value:.3g}" for value in rgba)
-    return f'{indent}<geom type="{kind}" size="{radius:.4g}" fromto="{_spaced(start)} {_spaced(stop)}" rgba="{colour}"/>'
+    ends = f"{_join_numbers(start)} {_join_numbers(stop)}"
+    return f'{indent}<geom type="{kind}" size="{radius:.4g}" fromto="{ends}" rgba="{colour}"/>'
 
 
 def _capsule(start, stop, radius: float, rgba, indent: str) -> str:
@@ -532,7 +561,7 @@ def _cylinder(start, stop, radius: float, rgba, indent: str) -> str:
     return _geom("cylinder", start, stop, radius, rgba, indent)
 
 
-def _spaced(values) -> str:
+def _join_numbers(values) -> str:
     return " ".join(f"{round(float(value), 5) + 0.0:g}" for value in values)
 
 

@@ -13,11 +13,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hydrotele.convert.robot_packages import PackageFinder
-from hydrotele.convert.shapes import Shape, import_optional, read_mesh
+from hydrotele.convert.shapes import Shape, ShapeKind, import_optional, read_mesh
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 
 JointKind = Literal["hinge", "slide", "fixed"]
+
+
+_JOINT_KINDS: dict[str, JointKind] = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}
 
 
 class Inertial(NamedTuple):
@@ -197,7 +200,7 @@ class _UrdfReader:
                 shapes.append(Shape("sphere", (self._number(item, "radius", 0.0), 0.0, 0.0), rgba=colour))
             elif item.tag == "mesh":
                 shapes += self._read_mesh(item, rgba)
-        return [shape.moved(rotation, position) for shape in shapes]
+        return [shape.transform(rotation, position) for shape in shapes]
 
     def _read_mesh(self, item, rgba: tuple[float, ...] | None) -> list[Shape]:
         address = item.get("filename", "")
@@ -223,7 +226,7 @@ class _UrdfReader:
             raise InputError(self.path, f"link {child!r} has two parents, {link.parent!r} and {parent!r}")
         link.parent, link.joint = parent, name
         link.rotation, link.position = self._pose(element)
-        link.kind = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide"}.get(kind, "fixed")
+        link.kind = _JOINT_KINDS.get(kind, "fixed")
         if kind in ("floating", "planar"):
             self.notes.append(f"joint {name} is {kind}; the machine stands on the ground, the joint is locked")
         elif kind not in ("fixed", "revolute", "continuous", "prismatic"):
@@ -274,7 +277,7 @@ class _UrdfReader:
 
     def _numbers(self, element, key: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
         text = None if element is None else element.get(key)
-        if text is None:
+        if element is None or text is None:
             return default
         try:
             values = tuple(float(word) for word in text.split())
@@ -323,13 +326,19 @@ def _read_mjcf_robot(path: Path) -> Robot:
                 if kind == mujoco.mjtTrn.mjTRN_JOINT}  # fmt: skip
     for body in range(1, model.nbody):
         name = model.body(body).name or f"body_{body}"
-        parent, rotation, position = names[model.body_parentid[body]], _matrix(model.body_quat[body]), model.body_pos[body]
+        parent, rotation, position = (
+            names[model.body_parentid[body]],
+            _matrix(model.body_quat[body]),
+            model.body_pos[body],
+        )
         first, count = model.body_jntadr[body], model.body_jntnum[body]
         offset = np.zeros(3)
         link = RobotLink(name, parent, rotation, position.copy())
         for number, joint in enumerate(range(first, first + count)):
             last = number == count - 1
-            link = RobotLink(name if last else f"{name}_{number}", parent, rotation, position + rotation @ model.jnt_pos[joint])
+            link = RobotLink(
+                name if last else f"{name}_{number}", parent, rotation, position + rotation @ model.jnt_pos[joint]
+            )
             kind = mujoco.mjtJoint(model.jnt_type[joint])
             link.joint = model.joint(joint).name or f"{link.name}_joint"
             if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
@@ -355,7 +364,7 @@ def _read_mjcf_robot(path: Path) -> Robot:
         name = names[model.geom_bodyid[geom]]
         if (shape := _mjcf_shape(model, geom)) is None:
             continue
-        shape = shape.moved(np.eye(3), -offsets[name])
+        shape = shape.transform(np.eye(3), -offsets[name])
         if model.geom_contype[geom] or model.geom_conaffinity[geom]:
             links[name].collisions.append(shape)
         if model.geom_group[geom] < 3:
@@ -393,7 +402,7 @@ def _matrix(quat) -> np.ndarray:
 def _mjcf_shape(model, geom: int) -> Shape | None:
     import mujoco
 
-    kinds = {
+    kinds: dict[mujoco.mjtGeom, ShapeKind] = {
         mujoco.mjtGeom.mjGEOM_BOX: "box", mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
         mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule", mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
         mujoco.mjtGeom.mjGEOM_MESH: "mesh",

@@ -11,6 +11,7 @@ from hydrotele.core.errors import InputError
 
 MAX_FACES = 60_000  # triangles of one mesh; larger meshes slow down the viewer and are simplified
 MAX_MESH_MB = 300.0
+ShapeKind = Literal["box", "cylinder", "capsule", "sphere", "mesh"]
 _MAX_COLOURS = 6  # of one textured mesh, each a geom
 _MIN_COLOUR_FRACTION = 0.01  # of the faces
 _CIRCLE = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
@@ -31,7 +32,7 @@ class Shape:
         faces: (m, 3) vertex indices of the triangles of a mesh.
     """
 
-    kind: Literal["box", "cylinder", "capsule", "sphere", "mesh"]
+    kind: ShapeKind
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     position: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -39,7 +40,7 @@ class Shape:
     vertices: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     faces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), int))
 
-    def moved(self, rotation: np.ndarray, position: np.ndarray) -> "Shape":
+    def transform(self, rotation: np.ndarray, position: np.ndarray) -> "Shape":
         """Return the shape rotated by `rotation` (3, 3), then displaced by `position` (3,)."""
         return replace(self, rotation=rotation @ self.rotation, position=rotation @ self.position + position)
 
@@ -185,7 +186,7 @@ def _split_by_colour(part, faces: np.ndarray) -> list[tuple[tuple[float, ...], n
         rows = ((1.0 - place[:, 1]) * (pixels.shape[0] - 1)).astype(int)
         colours = pixels[rows, (place[:, 0] * (pixels.shape[1] - 1)).astype(int)]
         count = min(_MAX_COLOURS, len(np.unique(colours, axis=0)))
-        centres, label = kmeans2(colours, count, minit="++", seed=0)
+        centres, label = kmeans2(colours, count, minit="++", rng=0)
         sizes = np.bincount(label, minlength=count)
         label = np.where(sizes[label] < _MIN_COLOUR_FRACTION * len(faces), np.argmax(sizes), label)
         return [((*map(float, centres[k]), 1.0), faces[label == k]) for k in range(count) if np.any(label == k)]

@@ -14,7 +14,10 @@ _MARKED = re.compile(rf"#\s*{ESTIMATE_MARK}\b")
 
 # The steady state first: geometry and areas set forces and speeds; the rest changes the transients.
 _GROUPS = (
-    ("pins and strokes of the cylinders", re.compile(r"axes\..*\.(base_pin|rod_pin|closed_length|stroke)|links\..*\.position|closures")),
+    (
+        "pins and strokes of the cylinders",
+        re.compile(r"axes\..*\.(base_pin|rod_pin|closed_length|stroke)|links\..*\.position|closures"),
+    ),
     ("bores, rods and motors", re.compile(r"axes\..*\.(bore|rod_diameter|area_|count|displacement)")),
     ("pump and relief valve", re.compile(r"supply\.")),
     ("masses", re.compile(r"links\.")),

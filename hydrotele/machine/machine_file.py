@@ -324,8 +324,9 @@ def _read_mjcf_body(body, degrees: bool, where: str) -> dict:
 def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
     """Convert drive parameters in other forms to those of `Axis`, in place.
 
-    `bore` and `rod_diameter` [m] of `count` equal cylinders become their areas. Pins in polar coordinates become points. `torque_per_psi` [N m/psi] times `gear_ratio` of a
-    motor becomes its displacement [m^3/rad].
+    `bore` and `rod_diameter` [m] of `count` equal cylinders become their areas. Pins in polar
+    coordinates become points. `torque_per_psi` [N m/psi] times `gear_ratio` of a motor becomes its
+    displacement [m^3/rad].
     """
     for name, axis in _section_entries(data, "axes").items():
         if not isinstance(axis, dict):
@@ -349,7 +350,8 @@ def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
 def _convert_diameters(cylinder: dict, where: str) -> dict:
     """Return a cylinder with its areas computed from `bore`, `rod_diameter` and `count`, if it has them.
 
-    Raise InputError for a diameter beside an area, one diameter alone, or a rod that is not thinner than the bore.
+    Raise InputError for a diameter together with an area, one diameter alone, or a rod that is not
+    thinner than the bore.
     """
     stems = {split_unit(str(key))[0]: str(key) for key in cylinder}
     given = {stem: stems[stem] for stem in ("bore", "rod_diameter", "count") if stem in stems}
