@@ -61,7 +61,7 @@ def hydraulic_class(length: float) -> HydraulicClass:
     EC20, CAT 215, CAT 325, ZX120 and ZX200 (33 .. 226 cm^2), their pump flows and swing torques.
     """
     ratio = length / REFERENCE_LENGTH
-    return HydraulicClass(33.0e-4 * ratio**1.8, 50.0 / 6.0e4 * ratio**2, 30.0e6, 70.0e-6 * ratio**3)
+    return HydraulicClass(33.0e-4 * ratio**1.8, 50.0 / 6.0e4 * ratio**2, 30.0e6, 85.0e-6 * ratio**3)
 
 
 def machine_mass(length: float) -> float:

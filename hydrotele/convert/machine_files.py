@@ -19,6 +19,7 @@ _MAX_HULL_POINTS = 200
 _YELLOW, _DARK, _CHROME = (0.95, 0.66, 0.06, 1.0), (0.2, 0.2, 0.21, 1.0), (0.86, 0.88, 0.9, 1.0)
 _FRICTION_PRESSURE = 0.15e6  # Pa: seal friction over head-side area, CAT 325 0.146e6, EC20 0.150e6
 _VISCOUS_PRESSURE = 0.4e6  # Pa s/m: CAT 325 0.29e6, EC20 0.9e6
+_MOTOR_VOLUME = 0.5  # rad, chamber volume over displacement: CAT 215 0.38, CAT 325 0.61
 _PASSIVE_DAMPING = 60.0  # N m s/rad, grapple link of the CAT 215 (boom of 5.2 m)
 _SCENARIO = "moves.yaml"
 
@@ -222,7 +223,7 @@ def _motor_lines(link: MovingLink, drive: Drive, scale: float, mark: str) -> lis
         f"    joint: {link.joint}",
         "    motor:",
         f"      displacement: {_number(drive.displacement, 3)}   {mark}",
-        f"      dead_volume: {_number(1.5e-3 * scale**3 * max(size, 0.1), 3)}   {mark}",
+        f"      dead_volume: {_number(_MOTOR_VOLUME * drive.displacement, 3)}   {mark}",
         f"      leakage: {_number(1.0e-12 * max(scale, 0.1), 3)}   {mark}",
         f"      friction: {{coulomb: {_number(3000 * size, 3)}, viscous: {_number(2000 * size, 3)},"
         f" stribeck_velocity: 0.05}}   {mark}",
