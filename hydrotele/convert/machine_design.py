@@ -24,6 +24,7 @@ _AREA_OF_ROLE = {"boom": 1.0, "stick": 0.7, "plane": 0.6, "tool": 0.5, "telescop
 _HOLDING_PRESSURE_FRACTION = 0.6  # of the relief pressure that may hold the arm stretched
 _MAX_ENLARGEMENT = 4.0  # of an estimated area
 _GRAVITY = 9.81
+_MAX_SIZE_RATIO = 20.0  # size of a link over the longest arm link
 _CLEARANCE = 0.1  # m between the moving links and the ground at home
 _ROTATOR_DISPLACEMENT = 0.085  # of the swing motor's, CAT 215 with grapple
 
@@ -91,6 +92,7 @@ def design_machine(tree: MachineTree, where: object) -> MachineDesign:
     longest = max(lengths)
     if longest < 1e-3:
         raise InputError(where, "all joints are at one point; are the origins of the joints missing?")
+    _check_sizes(tree, longest, where)
     _stand_on_ground(tree, longest)
     bodies = {name: estimate_body(link, longest) for name, link in tree.links.items()}
     hydraulics = hydraulic_class(longest)
@@ -117,6 +119,16 @@ def design_machine(tree: MachineTree, where: object) -> MachineDesign:
             notes.append(f"mass and inertia of {name} replaced by an estimate, {body.mass:.3g} kg: {body.reason}")
     notes.append(f"class: longest arm link {longest:.3g} m, typical machine mass {machine_mass(longest) / 1e3:.2g} t")
     return design
+
+
+def _check_sizes(tree: MachineTree, longest: float, where: object) -> None:
+    """Raise InputError if the shapes of a link are much larger than the arm, as meshes in millimetres are."""
+    for name, link in tree.links.items():
+        points = [shape.points() for shape in link.visuals]
+        size = float(np.ptp(np.vstack(points), axis=0).max()) if points else 0.0
+        if size > _MAX_SIZE_RATIO * longest:
+            message = f"the shapes of {name} are {size:.3g} m long, the arm's links at most {longest:.3g} m;"
+            raise InputError(where, f'{message} give meshes in millimetres scale="0.001 0.001 0.001"')
 
 
 def _stand_on_ground(tree: MachineTree, longest: float) -> None:

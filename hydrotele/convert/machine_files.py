@@ -187,7 +187,7 @@ def _cylinder_lines(link: MovingLink, drive: Drive, mark: str) -> list[str]:
     closed = cylinder.closed_length
 
     def part(mass: float) -> str:
-        across = mass * closed**2 / 12.0
+        across = mass * (closed**2 / 12.0 + bore**2 / 6.0)
         inertia = _numbers([mass * bore**2 / 3.0, across, across], 3)
         return f"{{mass: {_number(mass, 3)}, com: {_number(0.48 * closed, 3)}, inertia: {inertia}}}"
 

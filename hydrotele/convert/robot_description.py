@@ -160,7 +160,7 @@ class _UrdfReader:
         if self.missing:
             names = list(dict.fromkeys(self.missing))
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            self.notes.append(f"meshes not found, drawn as bars: {', '.join(names[:3])}{more}")
+            self.notes.append(f"meshes not found or empty: {', '.join(names[:3])}{more}")
         return Robot(root.get("name") or self.path.stem, ordered, [], self.notes)
 
     def _read_link(self, element, name: str, colours: dict) -> RobotLink:
@@ -212,6 +212,8 @@ class _UrdfReader:
         key = (path, scale, rgba)
         if key not in self.meshes:
             self.meshes[key] = read_mesh(path, np.array(scale), rgba)
+        if not self.meshes[key]:
+            self.missing.append(address)
         return self.meshes[key]
 
     def _read_joint(self, element, links: dict[str, RobotLink]) -> None:

@@ -251,7 +251,7 @@ def test_missing_extra_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "note"),
     [
-        (lambda b: b.replace('<box size="4.6 0.4 0.5"/>', '<mesh filename="package://a/b.dae"/>'), "meshes not found"),
+        (lambda b: b.replace('<box size="4.6 0.4 0.5"/>', '<mesh filename="package://a/b.dae"/>'), "meshes not found or empty"),
         (lambda b: b + link("other"), "several root links"),
         (lambda b: b + link("wheel", "1 1 1") + joint("wheel", "base_link", "wheel", "1 1 0", "continuous"),
          "not part of the arm and locked at 0: wheel"),
@@ -303,6 +303,14 @@ def test_files_that_are_no_hydraulic_machine_are_refused(tmp_path, text, message
     with pytest.raises(InputError, match=message.replace("(", r"\(")):
         create_machine(str(tmp_path / "new"), tmp_path / "robot.urdf")
     assert not (tmp_path / "new").exists()
+
+
+def test_mesh_in_millimetres_without_scale_is_refused(tmp_path):
+    pytest.importorskip("trimesh")
+    shapes.write_stl(tmp_path / "boom.stl", *TETRAHEDRON)
+    body = DIGGER.replace('<box size="4.6 0.4 0.5"/>', '<mesh filename="boom.stl"/>')
+    with pytest.raises(InputError, match="scale="):
+        make(tmp_path, body)
 
 
 def test_large_meshes_are_simplified(monkeypatch):
