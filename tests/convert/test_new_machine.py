@@ -251,7 +251,8 @@ def test_missing_extra_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "note"),
     [
-        (lambda b: b.replace('<box size="4.6 0.4 0.5"/>', '<mesh filename="package://a/b.dae"/>'), "meshes not found or empty"),
+        (lambda b: b.replace('<box size="4.6 0.4 0.5"/>', '<mesh filename="package://a/b.dae"/>'),
+         "meshes not found or empty"),
         (lambda b: b + link("other"), "several root links"),
         (lambda b: b + link("wheel", "1 1 1") + joint("wheel", "base_link", "wheel", "1 1 0", "continuous"),
          "not part of the arm and locked at 0: wheel"),
