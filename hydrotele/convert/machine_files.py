@@ -269,13 +269,19 @@ def _scenario_yaml(name: str, design: MachineDesign) -> str:
     for link in design.driven_links():
         home = design.home[link.joint]
         low, high = link.range or (home - 1.5, home + 1.5)
-        away = 0.2 * (high - low)
+        away = min(0.2 * (high - low), 0.6)  # rad or m in 4 s
         target = home + away if home + away < high - 0.05 * (high - low) else home - away
         duration = 4.0
         points += [
             f"    - {{duration: {duration:g}, joints: {{{link.joint}: {value:.4g}}}}}" for value in (target, home)
         ]
     total = 2.0 + 4.0 * len(points)
+    swing = design.tree.with_role("swing")
+    slow = (
+        [f"servo: {{axis_gains: {{{swing.joint}: 1.0}}}}   # at the usual 4 1/s a heavy upper structure swings"]
+        if swing
+        else []
+    )
     return "\n".join([
         "name: moves",
         f"description: Each axis of {name} moved to and fro by a fifth of its range",
@@ -283,6 +289,7 @@ def _scenario_yaml(name: str, design: MachineDesign) -> str:
         "seed: 1",
         f"duration: {total:g}",
         "sensors: typical",
+        *slow,
         "pilot:",
         "  kind: waypoints",
         "  settle: 1.0",
