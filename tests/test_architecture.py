@@ -23,7 +23,7 @@ FLOORS = (
     ("scenario",),
     ("estimate",),
     ("identify",),
-    ("simulate",),
+    ("simulate", "convert"),
     ("control",),
     ("teleop",),
     ("haptics",),

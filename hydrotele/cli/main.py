@@ -17,6 +17,7 @@ import typer
 from hydrotele.cli.calibrate_options import app as calibrate_app
 from hydrotele.cli.haptic_device_options import HAPTIC_EPILOG, haptic_device
 from hydrotele.cli.identify_operator_command import IDENTIFY_OPERATOR_EPILOG, identify_operator
+from hydrotele.cli.new_command import app as new_app
 from hydrotele.cli.number_options import MAX_PROCESSES, NumberCheckingGroup
 from hydrotele.cli.option_values import (
     CommandGroup,
@@ -241,6 +242,7 @@ app = CommandGroup(
 analyse_app = CommandGroup(help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True)
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
+app.add_typer(new_app, name="new")
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 MachineOption = Annotated[
@@ -605,8 +607,9 @@ def validate(
 ) -> None:
     """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
-    Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
-    next to the log, or that of its metadata.
+    Values of a machine file on lines with the comment "# estimate" are listed in the order in which
+    they should be replaced. Logs are checked as by gap, with the column names and ranges of
+    --machine. Default: the machine next to the log, or that of its metadata.
     """
     from hydrotele.cli.validate_command import LogMachine, validate_files
 

@@ -40,6 +40,7 @@ COMMAND_GROUPS = {
         "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
     },
     "Models and files": {
+        "new": "Create a machine from a robot description: URDF, xacro or MJCF.",
         "list": "List the available machines, scenarios, sweeps, effects and environments.",
         "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and line.",
         "export": "Write the complete MJCF of a machine or joystick, or an image of it.",

@@ -9,8 +9,9 @@ from hydrotele.cli.console import print_json, print_notes, stdout_console
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import LOG_SUFFIXES, MEASURED_STEM, find_logs
+from hydrotele.machine.estimate_marks import EstimateGroup, find_estimates
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
-from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, shipped_machines
+from hydrotele.machine.machine_file import MACHINE_FILE, find_machine_file, load_machine, shipped_machines
 
 
 class LogMachine(NamedTuple):
@@ -45,10 +46,13 @@ def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | N
             notes: list[str] = []
             kind, said = _validate_file(path, log_machine or LogMachine(), notes)
             entry = {"file": str(path), "kind": kind, "valid": True, "contents": said}
+            estimates = find_estimates(find_machine_file(path)) if kind == "machine" else []
+            entry |= {"estimates": [key for group in estimates for _, key in group.keys]} if estimates else {}
             checked.append(entry | ({"notes": notes} if kind == "log" else {}))
             if not as_json:
                 stdout_console.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
                 print_notes(notes)
+                _print_estimates(estimates)
         except InputError as error:
             checked.append({"file": str(path), "valid": False, "error": str(error)})
             wrong.append(error)
@@ -58,6 +62,24 @@ def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | N
         typer.echo(f"error {error}", err=True)
     if wrong:
         raise wrong[-1]
+
+
+def _print_estimates(groups: list[EstimateGroup]) -> None:
+    """Print the marked values of a machine file in the order in which they should be replaced."""
+    if not groups:
+        return
+    count = sum(len(group.keys) for group in groups)
+    stdout_console.print(f"{count} lines are estimates; replace the values and remove the marks, in this order:")
+    for number, (title, keys) in enumerate(groups, start=1):
+        sections: dict[str, list[tuple[int, str]]] = {}
+        for line, key in keys:
+            section, _, last = key.rpartition(".")
+            sections.setdefault(section, []).append((line, last))
+        listed = "; ".join(
+            f"{section}: {', '.join(last for _, last in found)} (line {found[0][0]})"
+            for section, found in sections.items()
+        )
+        stdout_console.print(f"  {number}. {title}: {listed}", soft_wrap=True)
 
 
 def _validate_file(path: Path, log_machine: LogMachine, notes: list[str]) -> tuple[str, str]:

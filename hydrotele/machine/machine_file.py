@@ -324,13 +324,17 @@ def _read_mjcf_body(body, degrees: bool, where: str) -> dict:
 def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
     """Convert drive parameters in other forms to those of `Axis`, in place.
 
-    Pins in polar coordinates become points. `torque_per_psi` [N m/psi] times `gear_ratio` of a
-    motor becomes its displacement [m^3/rad].
+    `bore` and `rod_diameter` [m] of `count` equal cylinders become their areas. Pins in polar
+    coordinates become points. `torque_per_psi` [N m/psi] times `gear_ratio` of a motor becomes its
+    displacement [m^3/rad].
     """
     for name, axis in _section_entries(data, "axes").items():
         if not isinstance(axis, dict):
             continue
         cylinder, motor = axis.get("cylinder"), axis.get("motor")
+        if isinstance(cylinder, dict):
+            where = _format_location(path, lines, "axes", name, "cylinder")
+            cylinder = axis["cylinder"] = _convert_diameters(cylinder, where)
         for part in ("base_pin", "rod_pin"):
             if isinstance(cylinder, dict) and isinstance(cylinder.get(part), dict):
                 where = _format_location(path, lines, "axes", name, "cylinder", part)
@@ -341,6 +345,35 @@ def _convert_drive_parameters(data: dict, path: Path, lines) -> None:
             torque = _parse_finite_number(motor.pop("torque_per_psi"), where)
             ratio = _parse_finite_number(motor.pop("gear_ratio", 1.0), where)
             axis["motor"] = motor | {"displacement": torque * ratio / PSI}
+
+
+def _convert_diameters(cylinder: dict, where: str) -> dict:
+    """Return a cylinder with its areas computed from `bore`, `rod_diameter` and `count`, if it has them.
+
+    Raise InputError for a diameter together with an area, one diameter alone, or a rod that is not
+    thinner than the bore.
+    """
+    stems = {split_unit(str(key))[0]: str(key) for key in cylinder}
+    given = {stem: stems[stem] for stem in ("bore", "rod_diameter", "count") if stem in stems}
+    if not given:
+        return cylinder
+    if both := [stems[stem] for stem in ("area_head", "area_rod") if stem in stems]:
+        raise InputError(where, f"has {both[0]} and {next(iter(given.values()))}; give diameters or areas, not both")
+    if missing := [stem for stem in ("bore", "rod_diameter") if stem not in given]:
+        raise InputError(where, f"{missing[0]} is missing; the areas need bore and rod_diameter")
+    values = {}
+    for stem, key in given.items():
+        value = _parse_finite_number(cylinder[key], f"{where}.{key}")
+        values[stem] = value * (split_unit(key)[1] or 1.0) if key != stem else value
+    count = values.get("count", 1.0)
+    if not 0.0 <= values["rod_diameter"] < values["bore"]:
+        raise InputError(where, "rod_diameter must be smaller than bore")
+    if count < 1.0 or count != round(count):
+        raise InputError(where, f"count must be a number of cylinders, 1 or more, not {count:g}")
+    head = count * math.pi / 4.0 * values["bore"] ** 2
+    rod = count * math.pi / 4.0 * values["rod_diameter"] ** 2
+    kept = {key: value for key, value in cylinder.items() if key not in given.values()}
+    return kept | {"area_head": head, "area_rod": head - rod}
 
 
 def _convert_polar_pin(pin: dict, data: dict, where: str) -> dict:

@@ -1,0 +1,1 @@
+"""Create a machine from a robot description: URDF, xacro or MJCF."""
