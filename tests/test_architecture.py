@@ -20,6 +20,7 @@ FLOORS = (
     ("terms", "machine", "effects"),
     ("kinematics", "hydraulics", "multibody", "soil"),
     ("logs",),
+    ("importers",),
     ("scenario",),
     ("estimate",),
     ("identify",),

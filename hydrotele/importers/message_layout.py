@@ -20,6 +20,7 @@ from hydrotele.importers.bag_files import Topic, import_library
 
 NAME_FIELDS = ("name", "names", "joint_names", "key", "label", "Name")
 MAX_LISTED_ELEMENTS = 64  # elements of longer arrays, such as images, are not listed as paths
+_MAX_LAYOUTS = 32  # layouts of messages of one size that are remembered
 _ELEMENT = re.compile(r"(?P<array>.*)\[(?P<element>[^\[\]]*)\]", re.DOTALL)
 _DTYPES: Mapping[str, str] = {
     "bool": "u1", "byte": "u1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
@@ -117,7 +118,7 @@ class RosDecoder:
         self.fields = _read_definitions(topic)
         if self.type not in self.fields:
             raise UndecodableTopic(f"the file contains no definition of its type {topic.type}")
-        self._layouts: dict[int, list[tuple[bytes, _Layout]]] = {}
+        self._layouts: dict[int, list[tuple[np.ndarray, _Layout]]] = {}  # by size of the message
 
     def list_paths(self, data: bytes) -> list[str]:
         """Return the paths of all numbers in a message."""
@@ -129,7 +130,7 @@ class RosDecoder:
         sizes = np.array([len(data) for data in messages])
         for size in np.unique(sizes):
             places = np.flatnonzero(sizes == size)
-            content = np.frombuffer(b"".join(messages[k] for k in places), np.uint8).reshape(len(places), size)
+            content = np.frombuffer(b"".join(messages[int(k)] for k in places), np.uint8).reshape(len(places), size)
             self._decode_equal_sizes(content, places, paths, result)
         return result
 
@@ -137,29 +138,29 @@ class RosDecoder:
         """Decode messages (m, size) of equal size into the rows `places` (m,) of the result."""
         left = np.ones(len(places), dtype=bool)
         known = self._layouts.setdefault(content.shape[1], [])
-        for number in range(len(places) + len(known)):
-            if not left.any():
-                return
-            if number >= len(known):
-                data = content[int(np.argmax(left))].tobytes()
-                try:
-                    layout = _Walker(self, data).walk()
-                except (struct.error, UndecodableTopic):
-                    left[int(np.argmax(left))] = False  # a damaged message
-                    known.append((b"", _Layout({}, {}, np.zeros(0, dtype=int))))
-                    continue
-                known.append((np.frombuffer(data, np.uint8)[layout.shape].tobytes(), layout))
-            shape, layout = known[number]
-            if not layout.shape.size and shape == b"" and not layout.numbers and not layout.arrays:
+        del known[:-_MAX_LAYOUTS]
+        for layout in known:
+            self._read_columns(layout, content, places, paths, result, left)
+        while left.any():
+            first = int(np.argmax(left))
+            try:
+                made = _Walker(self, content[first].tobytes()).walk()
+            except (struct.error, UndecodableTopic):
+                left[first] = False  # a damaged message
                 continue
-            alike = left & (content[:, layout.shape] == np.frombuffer(shape, np.uint8)).all(axis=1)
-            left &= ~alike
-            rows = np.flatnonzero(alike)
-            for column, path in enumerate(paths):
-                if len(rows) and (found := layout.find(path)):
-                    offset, dtype = found
-                    part = np.ascontiguousarray(content[rows, offset : offset + np.dtype(dtype).itemsize])
-                    result[places[rows], column] = part.view(dtype)[:, 0]
+            known.append((content[first, made.shape], made))
+            self._read_columns(known[-1], content, places, paths, result, left)
+
+    def _read_columns(self, layout, content, places, paths: Sequence[str], result: np.ndarray, left) -> None:
+        """Read the messages of one layout, of those in `left` (m,), and remove them from it."""
+        shape, places_of_numbers = layout
+        rows = np.flatnonzero(left & (content[:, places_of_numbers.shape] == shape).all(axis=1))
+        left[rows] = False
+        for column, path in enumerate(paths):
+            if len(rows) and (found := places_of_numbers.find(path)):
+                offset, dtype = found
+                part = np.ascontiguousarray(content[rows, offset : offset + np.dtype(dtype).itemsize])
+                result[places[rows], column] = part.view(dtype)[:, 0]
 
 
 class _Walker:
@@ -242,9 +243,10 @@ class _Walker:
         if kind not in self.fields:
             raise UndecodableTopic(f"the file contains no definition of the type {kind}")
         if label:
-            for places, old in ((self.numbers, before[0]), (self.arrays, before[1])):
-                for known in [key for key in places if key not in old]:
-                    places[f"{path}[{label}].{known.removeprefix(prefix)}"] = places.pop(known)
+            own: dict[str, Any]
+            for own, old in ((self.numbers, before[0]), (self.arrays, before[1])):
+                for known in [key for key in own if key not in old]:
+                    own[f"{path}[{label}].{known.removeprefix(prefix)}"] = own.pop(known)
 
     def _dtype(self, name: str) -> str:
         if name not in _DTYPES:

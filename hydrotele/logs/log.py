@@ -21,7 +21,6 @@ from hydrotele.core.units import canonical_unit, si_unit_and_factor
 from hydrotele.logs.table import DATE_UNIT, Table, parse_label, read_table
 from hydrotele.logs.time_stamps import repair_time_stamps
 from hydrotele.machine import log_channels
-from hydrotele.machine.log_columns import SKIP_COLUMN, LogColumn, log_columns_for
 from hydrotele.machine.log_channels import (
     allowed_channel_units,
     default_channel_unit,
@@ -29,6 +28,7 @@ from hydrotele.machine.log_channels import (
     plausible_magnitude_limits,
     suggest_channel_names,
 )
+from hydrotele.machine.log_columns import SKIP_COLUMN, LogColumn, log_columns_for
 
 if TYPE_CHECKING:
     import pyarrow as pa
