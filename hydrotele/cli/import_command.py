@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from hydrotele.cli.console import make_table, print_json, print_notes, stderr_console, stdout_console
+from hydrotele.cli.console import print_json, print_notes, stderr_console, stdout_console
 from hydrotele.cli.input_logs import open_single_log
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
@@ -65,8 +65,10 @@ def write_mapping(log: Path, target: Path, machine: str | None, tool: str | None
     text = format_mapping(proposals, log.name)
     with atomic_file(target, ".yaml") as part:
         part.write_text(text, encoding="utf-8")
-    stdout_console.print(text, markup=False, soft_wrap=True, end="")
-    stderr_console.print(f"written to {target}; check it, then: hydrotele import {log} --mapping {target}")
+    print(text, end="")
+    stderr_console.print(
+        f"written to {target}; check it, then: hydrotele import {log} --mapping {target}", markup=False, soft_wrap=True
+    )
 
 
 def _find_columns(log: Path, machine: Machine | None, mapping: Path | None) -> dict[str, LogColumn]:
@@ -102,12 +104,11 @@ def _name_targets(runs: Sequence[Sequence[Path]], out: Path | None) -> list[Path
 
 
 def _print_report(log: Log, report: ImportReport, target: Path) -> None:
-    shown = make_table(f"{len(log)} rows", "channel", "column", "values", "rate [Hz]", "placed on rows", "missing")
+    width = max(len(channel.channel) for channel in report.channels)
     for channel in report.channels:
-        missing = f"{100 * channel.missing:.3g} %" if channel.missing else ""
-        cells = f"{channel.samples}", f"{channel.rate:.4g}", channel.placement, missing
-        shown.add_row(channel.channel, channel.source, *cells)
-    stdout_console.print(shown)
+        missing = f", {100 * channel.missing:.3g} % missing" if channel.missing else ""
+        text = f"{channel.samples} values at {channel.rate:.4g} Hz, {channel.placement}{missing}"
+        print(f"{channel.channel:<{width}}  {channel.source}: {text}")
     if report.ignored:
         listed = sorted(report.ignored.items(), key=lambda item: -item[1])
         more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
@@ -116,7 +117,7 @@ def _print_report(log: Log, report: ImportReport, target: Path) -> None:
     if report.unused:
         print_notes([f"the mapping names {', '.join(report.unused)}, which the log does not contain."])
     print_notes(report.notes)
-    stdout_console.print(f"written to [bold]{target}[/]", soft_wrap=True)
+    stdout_console.print(f"{len(log)} rows written to [bold]{target}[/]", soft_wrap=True)
 
 
 def export_log(path: Path, mcap: Path, machine: str | None, tool: str | None, force: bool) -> None:

@@ -242,7 +242,7 @@ def _choose_times(groups: Mapping[str, Group], recordings: Sequence[Recording], 
                 f"{groups[label].name}: its clock was shifted by {difference:+.6g} s: the shortest delay between stamp"
                 f" and reception is {shortest[label]:.4g} s, that of {groups[main].name} {shortest[main]:.4g} s."
             )
-        if delay is not None and (delays[main] is None or None in delays.values()):
+        if delay is not None and any(other is None for other in delays.values()):
             quarter = max(len(delay) // 4, 1)
             drift = float(np.median(delay[-quarter:]) - np.median(delay[:quarter]))
             if abs(drift) > period:
@@ -357,7 +357,8 @@ def _place_on_rows(rows: np.ndarray, item: _Series, held: bool) -> tuple[np.ndar
         return item.value, "rows"
     known = _sort(_known(item))
     if held:
-        latest = np.searchsorted(known.time, rows, side="right") - 1
+        middle = rows + 0.5 * _median_step(rows)  # a value is held until the next row
+        latest = np.searchsorted(known.time, middle, side="right") - 1
         return np.where(latest >= 0, known.value[np.maximum(latest, 0)], np.nan), "held"
     value = np.interp(rows, known.time, known.value)
     after = np.clip(np.searchsorted(known.time, rows), 1, len(known.time) - 1) if len(known.time) > 1 else 0

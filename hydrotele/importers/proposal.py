@@ -38,7 +38,7 @@ _KIND_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
     ("force", frozenset({"force"})),
     ("angle", frozenset({"angle", "position", "pos", "ang", "joint", "theta", "q", "winkel", "encoder", "resolver"})),
 )
-_SUPPLY_WORDS = frozenset({"supply", "pump", "system", "main", "versorgung"})
+_SUPPLY_WORDS = frozenset({"supply", "pump", "system", "main", "versorgung", "pumpe"})
 _HEAD_WORDS = frozenset({"head", "bottom", "bore", "cap", "base", "piston", "a", "large", "kolben", "blind"})
 _ROD_WORDS = frozenset({"rod", "ring", "annulus", "b", "small", "stange"})
 _OPPOSITE_WORDS = (("up", "down"), ("raise", "lower"), ("in", "out"), ("retract", "extend"), ("left", "right"),
@@ -122,7 +122,7 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
         return Proposal(column, channel, None, None, 1.0, f"is named like a channel, {span}")
     except ValueError:
         words = _split_words(column)
-    found, sure_kind = _find_kind(words, kind)
+    found, sure_kind = _find_kind(words, kind, unit)
     axis, sure_axis = _find_axis(words, machine)
     if not found or (not axis and found != "pressure_supply"):
         missing = "kind of channel" if not found else "axis"
@@ -137,16 +137,25 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
     return Proposal(column, channel, stated, None, sum(parts) / len(parts), reason)
 
 
-def _find_kind(words: Sequence[str], kind: str) -> tuple[str | None, float]:
-    """Return the kind of channel that the words of a column mean, and 1 if they state it, 0.5 for a guess."""
-    present = set(words) | ({"pressure"} if kind.endswith("FluidPressure") else set())
-    found = next((name for name, known in _KIND_WORDS if known & present), None)
+def _find_kind(words: Sequence[str], kind: str, unit: str | None) -> tuple[str | None, float]:
+    """Return the kind of channel that a column means, and 1 if its words state it, 0.5 for a guess.
+
+    Args:
+        words: words of the name.
+        kind: type of the messages, empty without one.
+        unit: unit that the file states, None without one.
+    """
+    present = set(words)
+    units = {si_unit_and_factor(text)[0] for text in (*(_UNIT_WORDS.get(word, "") for word in words), unit or "")}
+    if kind.endswith("FluidPressure") or "Pa" in units:
+        present.add("pressure")
+    found = next((name for name, known in _KIND_WORDS if known & present), "angle" if "rad" in units else None)
     if found == "command" and "pressure" in present and "pilot" not in present:
         found = "pressure"
     if found != "pressure":
         unsure = found in ("angle", "command") and not {"angle", "position", "command", "cmd"} & present
         return found, 0.5 if unsure else 1.0
-    if present & {"supply", "pump", "system"}:
+    if present & (_SUPPLY_WORDS - {"main"}):
         return "pressure_supply", 1.0
     for side, known in (("pressure_rod", _ROD_WORDS), ("pressure_head", _HEAD_WORDS)):
         if known & present:

@@ -187,10 +187,18 @@ def _to_si_units(table: Table) -> Table:
             unit, factor = si_unit_and_factor(stated)
         allowed = allowed_channel_units(name)
         if unit not in allowed:
+            remedy = "correct the unit, or rename the column to a channel with this unit"
+            if name.startswith("command."):
+                axis = name.removeprefix("command.")
+                remedy = (
+                    "correct the unit, state the range in the machine file, such as"
+                    f" axes.{axis}: {{command_unit: {stated}, command_range: [-30, 30]}}, or give `scale` and unit 1 in"
+                    " log_columns"
+                )
             raise InputError(
                 table.location(name),
                 f"has the unit {stated!r}; a log needs {' or '.join(allowed)}, to which it cannot be converted:"
-                " correct the unit, or rename the column to a channel with this unit",
+                f" {remedy}",
             )
         columns.append(values if factor == 1.0 else values * factor)
         units.append(unit)
