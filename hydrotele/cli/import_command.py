@@ -5,6 +5,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rich.text import Text
+
 from hydrotele.cli.console import print_json, print_notes, stderr_console, stdout_console
 from hydrotele.cli.input_logs import open_single_log
 from hydrotele.core.errors import InputError
@@ -66,9 +68,8 @@ def write_mapping(log: Path, target: Path, machine: str | None, tool: str | None
     with atomic_file(target, ".yaml") as part:
         part.write_text(text, encoding="utf-8")
     print(text, end="")
-    stderr_console.print(
-        f"written to {target}; check it, then: hydrotele import {log} --mapping {target}", markup=False, soft_wrap=True
-    )
+    said = f"written to {target}; check it, then: hydrotele import {log} --mapping {target}"
+    stderr_console.print(Text(said), soft_wrap=True)
 
 
 def _find_columns(log: Path, machine: Machine | None, mapping: Path | None) -> dict[str, LogColumn]:
@@ -113,7 +114,7 @@ def _print_report(log: Log, report: ImportReport, target: Path) -> None:
         listed = sorted(report.ignored.items(), key=lambda item: -item[1])
         more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
         text = ", ".join(f"{name} ({count})" for name, count in listed[:10])
-        stderr_console.print(f"ignored: {text}{more}", markup=False, soft_wrap=True)
+        stderr_console.print(Text(f"ignored: {text}{more}"), soft_wrap=True)
     if report.unused:
         print_notes([f"the mapping names {', '.join(report.unused)}, which the log does not contain."])
     print_notes(report.notes)

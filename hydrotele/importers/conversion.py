@@ -26,7 +26,7 @@ from hydrotele.machine.log_columns import SKIP_COLUMN, LogColumn
 
 _MAX_STEP_RATIO = 1.5  # a group whose median step is longer than this multiple of that of the rows is slower
 _MAX_DISTANCE_RATIO = 0.75  # of the median step of a group: between 0.5, in a full sequence, and 1, at a missing sample
-_MIN_FILLED_FRACTION = 0.5  # of the rows of a group: a column with fewer values has times of its own
+_MAX_SPARSE_FRACTION = 0.5  # of the rows of a group: a column with values in at most so many has times of its own
 _MAX_STEP_BACK = 1.0  # [s] of stamps: longer than any delay by which messages overtake each other
 _HELD_KINDS = ("command", "valid", "reference")
 
@@ -198,7 +198,7 @@ def _collect_series(recordings: Sequence[Recording], columns: Mapping[str, LogCo
             minus = np.interp(times[label], other.time, other.value)
         unit = entry.unit or group.units.get(key)
         series.append(_Series(key, entry, label, times[label], entry.convert(values, minus), unit))
-        if np.isfinite(values).mean() < _MIN_FILLED_FRACTION:
+        if np.isfinite(values).mean() <= _MAX_SPARSE_FRACTION:
             series[-1] = _known(series[-1])._replace(group=f"{label} {key}")
     return series
 
@@ -215,12 +215,10 @@ def _choose_times(groups: Mapping[str, Group], recordings: Sequence[Recording], 
     for label, group in groups.items():
         recording = recordings[int(label.partition(":")[0])]
         stamped, why = group.stamped, ""
-        if stamped is not None and not np.isfinite(stamped).all():
-            why = f"{100 * np.mean(~np.isfinite(stamped)):.0f} % of the messages have no stamp"
-        elif stamped is not None and (np.diff(stamped) < -_MAX_STEP_BACK).any():
+        if stamped is not None and (np.diff(stamped) < -_MAX_STEP_BACK).any():
             why = "the clock of the stamps was set back"
         elif stamped is not None and len(np.unique(stamped)) < 0.5 * len(stamped):
-            why = "most stamps are repeated"
+            why = "most stamps are 0 or repeated"
         used = group.received if stamped is None or why else stamped
         if stamped is not None:
             said = f"of reception is used: {why}" if why else "of the message stamps is used"

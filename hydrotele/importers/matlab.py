@@ -17,6 +17,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_limit, open_regular
 from hydrotele.importers.bag_files import import_library
 from hydrotele.importers.recordings import Group, Recording, convert_time, is_time_name
+from hydrotele.machine.log_channels import MEASURED_KINDS
 from hydrotele.machine.log_columns import LogColumn
 
 _NAME_KEYS = ("Name", "name", "label", "Label")
@@ -49,7 +50,10 @@ def read_matlab(path: Path, columns: Collection[str] | None, times: Mapping[str,
                 return _make_recording(path, _hdf5_to_tree(file, file), columns, times)
         except OSError as error:
             raise InputError(path, f"is a damaged MATLAB 7.3 file ({error}): copy it again") from None
-    return _make_recording(path, _read_version5(path, columns, times), columns, times)
+    tree, others = _read_version5(path, columns, times)
+    recording = _make_recording(path, tree, columns, times)
+    recording.ignored |= others
+    return recording
 
 
 def _has_hdf5_signature(file) -> bool:
@@ -57,22 +61,25 @@ def _has_hdf5_signature(file) -> bool:
     return file.read(8) == b"\x89HDF\r\n\x1a\n"
 
 
-def _read_version5(path: Path, columns: Collection[str] | None, times: Collection[str]) -> dict[str, Any]:
+def _read_version5(
+    path: Path, columns: Collection[str] | None, times: Collection[str]
+) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the variables that are needed, and the names and lengths of the others."""
     from scipy.io import loadmat, whosmat
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            names = [name for name, _, kind in whosmat(path) if kind not in ("char", "function", "opaque")]
+            found = {n: max(shape) for n, shape, kind in whosmat(path) if kind not in ("char", "function", "opaque")}
+            names = list(found)
             if columns is not None:
                 roots = {column.partition(".")[0].partition("[")[0] for column in (*columns, *times)}
-                names = [name for name in names if name in roots or is_time_name(name)]
-            return {k: v for k, v in loadmat(path, simplify_cells=True, variable_names=names).items() if k in names}
-    except InputError:
-        raise
+                names = [name for name in found if name in roots or is_time_name(name) or name in MEASURED_KINDS]
+            read = loadmat(path, simplify_cells=True, variable_names=names) if names else {}
     except Exception as error:  # a damaged file raises errors of many types
         reason = str(error).splitlines()[0][:100] if str(error) else type(error).__name__
         raise InputError(path, f"is not a readable MATLAB file, copy it again ({reason})") from None
+    return {k: v for k, v in read.items() if k in names}, {k: n for k, n in found.items() if k not in names}
 
 
 def _hdf5_to_tree(node, file) -> dict[str, Any]:

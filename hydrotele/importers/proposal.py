@@ -130,7 +130,7 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
     if found == "angle" and machine and axis in machine.axes:
         found = machine.position_kind(axis)
     channel = found if found == "pressure_supply" else f"{found}.{axis}"
-    stated, sure_unit, why = _find_unit(channel, words, unit, low, high)
+    stated, sure_unit, why = _find_unit(channel, words, kind, unit, low, high)
     parts = [sure_kind, sure_unit] if found == "pressure_supply" else [sure_axis, sure_kind, sure_unit]
     guesses = [name for name, sure in (("axis", sure_axis), ("kind", sure_kind)) if sure < 1.0 and sure > 0.0]
     reason = ", ".join([*(f"{name} guessed" for name in guesses), why, span])
@@ -183,7 +183,7 @@ def _find_axis(words: Sequence[str], machine: Machine | None) -> tuple[str, floa
 
 
 def _find_unit(
-    channel: str, words: Sequence[str], unit: str | None, low: float, high: float
+    channel: str, words: Sequence[str], kind: str, unit: str | None, low: float, high: float
 ) -> tuple[str | None, float, str]:
     """Return (unit to state, 1 if it is stated or 0.5 for a guess from the range, reason)."""
     allowed, size = allowed_channel_units(channel), max(abs(low), abs(high))
@@ -192,6 +192,8 @@ def _find_unit(
     for word in reversed(words):
         if (named := _UNIT_WORDS.get(word)) and si_unit_and_factor(named)[0] in (*allowed, "A"):
             return canonical_unit(named), 1.0, "unit in the name"
+    if kind.startswith("sensor_msgs/") and (allowed[0] != "rad" or size <= 4 * np.pi):
+        return None, 1.0, "SI by the type of the messages"
     if "Pa" in allowed:
         guess = "Pa" if size > 2e4 else "psi" if size > 1e3 else "bar" if size > 60.0 else "MPa"
         return guess, 0.5, "unit guessed from the range"

@@ -30,6 +30,7 @@ from hydrotele.machine.log_columns import LogColumn
 
 MATLAB_SUFFIX = ".mat"
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".lvm", ".parquet")
+_NO_STAMP = np.iinfo(np.int64).min  # stamp of a message that cannot be decoded
 _BATCH_MESSAGES = 1024
 _BATCH_BYTES = 4 * 2**20
 _LISTED_MESSAGES = 20_000  # messages per topic that are read to propose a mapping
@@ -211,8 +212,10 @@ class _TopicReader:
             self.columns = [array("d") for _ in self.paths]
         found = self.decoder.decode(self.waiting, [*self.paths, *(self.stamp or ())])
         if self.stamp:
-            whole = np.nan_to_num(found[:, -2:]).astype(np.int64)
-            self.stamped.frombytes((whole[:, 0] * 10**9 + whole[:, 1]).tobytes())
+            readable = np.isfinite(found[:, -2:]).all(axis=1)  # False for a damaged message
+            whole = np.where(readable[:, None], found[:, -2:], 0.0).astype(np.int64)
+            stamps = np.where(readable, whole[:, 0] * 10**9 + whole[:, 1], _NO_STAMP)
+            self.stamped.frombytes(stamps.tobytes())
         for column, values in zip(self.columns, found.T, strict=False):
             column.frombytes(values.tobytes())
         self.waiting, self.size = [], 0
@@ -231,17 +234,19 @@ class _TopicReader:
     def make_group(self, origin: int) -> Group:
         """Return the columns read; `origin` [ns] is the calendar time of time 0."""
         received = (np.frombuffer(self.received, np.int64) - origin) / 1e9
-        stamped = None
+        stamped, readable = None, np.ones(len(received), dtype=bool)
         if self.stamped:
             whole = np.frombuffer(self.stamped, np.int64)
-            stamped = np.where(whole != 0, (whole - origin) / 1e9, np.nan)
+            readable = whole != _NO_STAMP
+            stamped = (whole[readable] - origin) / 1e9
         names = self.paths if self.rest is None else list(self.rest)
         columns = {}
         for path, name, column in zip(self.paths, names, self.columns, strict=True):
             values = np.frombuffer(column, np.float64)
+            values = values if readable.all() else values[readable]
             if np.isfinite(values).any():
                 columns[f"{self.topic.name}.{path}" if self.rest is None else name] = values
-        return Group(self.topic.name, self.topic.type, received, stamped, columns)
+        return Group(self.topic.name, self.topic.type, received[readable], stamped, columns)
 
 
 def _read_bag(path: Path, columns: Collection[str] | None) -> Recording:
