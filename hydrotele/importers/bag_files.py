@@ -279,6 +279,7 @@ def _read_ros1(path: Path, add: _Add) -> _Records:
     with open_regular(path) as file:
         if file.read(len(_ROS1_MAGIC)) != _ROS1_MAGIC:
             raise InputError(path, "is not a ROS 1 bag of version 2.0, or its start is damaged: copy it again")
+        index_place = 0  # the recorder writes it when it closes the bag
         while head := file.read(4):
             if len(head) < 4:
                 raise _Damage("the file is truncated")
@@ -286,6 +287,7 @@ def _read_ros1(path: Path, add: _Add) -> _Records:
             size = struct.unpack("<I", _read_exactly(file, 4))[0]
             code = _ros1_code(header)
             if code not in (_ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CONNECTION):
+                index_place = index_place or int.from_bytes(header.get("index_pos", b""), "little")
                 file.seek(size, 1)
                 continue
             data = _read_exactly(file, size)
@@ -297,6 +299,8 @@ def _read_ros1(path: Path, add: _Add) -> _Records:
                 yield from _read_ros1_records(data, add)
             else:
                 yield from _read_ros1_record(header, data, add)
+        if not 0 < index_place <= path.stat().st_size or file.tell() > path.stat().st_size:
+            raise _Damage("the file is truncated, or its recorder did not close it")
 
 
 def _read_ros1_records(data: bytes, add: _Add) -> _Records:
@@ -366,6 +370,7 @@ def _read_sqlite(path: Path, add: _Add) -> _Records:
     mode = "mode=ro" if unfinished else "immutable=1"
     connection = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)
     try:
+        connection.execute("PRAGMA writable_schema=ON")  # reads the part of a truncated file that is there
         definitions = {}
         try:
             for name, form, text in connection.execute(_DEFINITION_QUERY):

@@ -174,7 +174,7 @@ class _Walker:
         self.at = self.start
         self.numbers: dict[str, tuple[int, str]] = {}
         self.arrays: dict[str, _Array] = {}
-        self.texts: dict[str, str] = {}
+        self.labelled: set[str] = set()  # paths of the elements that have a name
         self.shape: list[int] = []
 
     def walk(self) -> _Layout:
@@ -205,7 +205,7 @@ class _Walker:
             return ()
         if node.name == "BASE":
             if content[0] == "string":
-                self.texts[path] = self._read_text(path.rpartition(".")[2] in NAME_FIELDS and path.endswith("]"))
+                self._read_text(False)
             else:
                 dtype = self._dtype(content[0])
                 self._align(dtype)
@@ -219,7 +219,7 @@ class _Walker:
             dtype = self._dtype(element[1][0])
             if count:
                 self._align(dtype)
-            self.arrays[path] = _Array(self.at, dtype, count, names if len(names) == count else ())
+            self.arrays[path] = _Array(self.at, dtype, count, names if _are_names(names, count) else ())
             self.at += count * np.dtype(dtype).itemsize
             return ()
         if count > len(self.data):
@@ -228,7 +228,7 @@ class _Walker:
             is_name = path.rpartition(".")[2] in NAME_FIELDS
             return tuple(self._read_text(is_name) for _ in range(count))
         for place in range(count):
-            self._walk_element(element[1], path, place, names[place] if len(names) == count else "")
+            self._walk_element(element[1], path, place, names[place] if _are_names(names, count) else "")
         return ()
 
     def _walk_element(self, kind: str, path: str, place: int, label: str) -> None:
@@ -242,7 +242,8 @@ class _Walker:
                 self._walk_field(description, f"{prefix}{name}", ())
         if kind not in self.fields:
             raise UndecodableTopic(f"the file contains no definition of the type {kind}")
-        if label:
+        if label and f"{path}[{label}]" not in self.labelled:
+            self.labelled.add(f"{path}[{label}]")
             own: dict[str, Any]
             for own, old in ((self.numbers, before[0]), (self.arrays, before[1])):
                 for known in [key for key in own if key not in old]:
@@ -274,6 +275,11 @@ class _Walker:
             self.shape += range(self.at, self.at + length)
         self.at += length
         return content.rstrip(b"\0").decode(errors="replace") if is_name else ""
+
+
+def _are_names(names: Sequence[str], count: int) -> bool:
+    """Return whether texts name the `count` elements of an array: their number is the same, and no two are equal."""
+    return len(names) == count == len(set(names)) and all(names)
 
 
 def _normalise_type(name: str) -> str:
@@ -343,10 +349,13 @@ def flatten(value: Any, prefix: str = "", names: tuple[str, ...] = ()) -> Iterat
         for key, item in value.items():
             yield from flatten(item, f"{prefix}.{key}" if prefix else str(key), names)
     elif isinstance(value, list) and len(value) <= MAX_LISTED_ELEMENTS:
+        used: set[str] = set()
         for place, item in enumerate(value):
-            label = names[place] if len(names) == len(value) else str(place)
+            label = names[place] if _are_names(names, len(value)) else str(place)
             if isinstance(item, dict):
-                label = next((item[key] for key in NAME_FIELDS if isinstance(item.get(key), str)), label)
+                label = next((item[key] for key in NAME_FIELDS if isinstance(item.get(key), str)), "") or label
+            label = str(place) if label in used else label
+            used.add(label)
             yield from flatten(item, f"{prefix}[{label}]")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import check_limit
+from hydrotele.core.files import check_limit, get_limit
 from hydrotele.core.units import si_unit_and_factor
 from hydrotele.importers.bag_files import Bag, Message, Topic, is_bag
 from hydrotele.importers.message_layout import (
@@ -261,7 +261,7 @@ def _read_bag(path: Path, columns: Collection[str] | None) -> Recording:
         return bool(found)
 
     first: int | None = None
-    total = 0
+    total, most = 0, get_limit("LOG_VALUES")
     for message in bag.messages(is_wanted):
         name = message.topic.name
         first = message.received if first is None else first
@@ -276,8 +276,8 @@ def _read_bag(path: Path, columns: Collection[str] | None) -> Recording:
             unreadable[name] = str(error)
             del readers[name]
             continue
-        total += len(readers[name].paths)
-        if total > 10**6:
+        total += max(len(readers[name].paths), 1)
+        if total > most:
             check_limit(path, "LOG_VALUES", total)
     origin = first or 0
     groups = []
