@@ -8,7 +8,6 @@ largest memory are printed.
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -123,17 +122,30 @@ def write_mapping(path: Path, source: str) -> Path:
     return path
 
 
+# A process started by another one inherits its largest memory in `getrusage`, but not in /proc.
+PROGRAM = """
+import atexit, pathlib, re, resource, sys
+def write_usage():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    memory = re.search(r"VmHWM:\\s+(\\d+) kB", pathlib.Path("/proc/self/status").read_text())[1]
+    pathlib.Path(target).write_text(f"{used.ru_utime + used.ru_stime} {int(memory) / 1024}")
+target = sys.argv.pop(1)
+atexit.register(write_usage)
+from hydrotele.cli.start import main
+main()
+"""
+
+
 def run_import(log: Path, mapping: Path, out: Path) -> tuple[float, float, float]:
     """Import a log in a process; return its processor time [s], elapsed time [s] and largest memory [MB]."""
-    command = [sys.executable, "-m", "hydrotele", "import", str(log), "--mapping", str(mapping), "--out", str(out)]
+    usage = out.with_suffix(".usage")
+    options = ["import", str(log), "--mapping", str(mapping), "--out", str(out)]
     begin = time.perf_counter()
-    with open(out.with_suffix(".txt"), "w") as said:
-        process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, env={**os.environ, "NO_COLOR": "1"})
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        sys.exit(f"{' '.join(command)} failed:\n{out.with_suffix('.txt').read_text()}")
-    return usage.ru_utime + usage.ru_stime, time.perf_counter() - begin, usage.ru_maxrss / 1024
+    done = subprocess.run([sys.executable, "-c", PROGRAM, str(usage), *options], capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(f"hydrotele {' '.join(options)} failed:\n{done.stdout}{done.stderr}")
+    seconds, memory = map(float, usage.read_text().split())
+    return seconds, time.perf_counter() - begin, memory
 
 
 def main() -> None:
