@@ -638,7 +638,7 @@ Examples:  hydrotele import field.mcap --write-mapping field.yaml --machine my_e
 
 \b
 Reads ROS 1 bags (.bag), ROS 2 bags (folder, .db3, .mcap), plain MCAP, MATLAB files (.mat), CSV
-dialects and Parquet. The mapping is `log_columns` of the machine, or of log_columns.yaml beside the
+dialects and Parquet. The mapping is `log_columns` of the machine, or of log_columns.yaml next to the
 log, or of --mapping: source column or topic path to channel, unit, scale, sign, offset, wrap, minus.
 Needs pip install 'hydrotele[import]' for bags and MATLAB 7.3.
 """

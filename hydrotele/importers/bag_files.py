@@ -2,7 +2,7 @@
 
 Accepted are ROS 1 bags (`.bag`), ROS 2 bags (`.db3` and `.mcap`, alone or as a folder, also compressed)
 and plain MCAP files. Files are read from start to end, so that of a damaged file the part before the
-damage is kept. A message of a topic that is not wanted is counted but not copied.
+damage is kept. Messages of other than the requested topics are counted but not copied.
 """
 
 import bz2
@@ -23,7 +23,8 @@ _COMPRESSED_SUFFIXES = tuple(f"{suffix}.zstd" for suffix in BAG_SUFFIXES[1:])
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _MAX_RECORD_BYTES = 2**31  # a record that states a larger size is damaged
-_BLOCK_BYTES = 2**20
+_MAX_FILE_BYTES = 2**50  # a jump by a larger size leaves every file
+_MAX_STAMP = 2**63  # [ns] larger times are damaged
 
 
 class Topic(NamedTuple):
@@ -76,7 +77,7 @@ class Bag:
 
     Attributes:
         topics: topics by name.
-        counts: number of messages by topic, also of topics that were not wanted.
+        counts: number of messages by topic, also of topics that were not requested.
         notes: one sentence per damaged part.
     """
 
@@ -95,7 +96,7 @@ class Bag:
         self.notes: list[str] = []
 
     def messages(self, is_wanted: Callable[[Topic], bool]) -> Iterator[Message]:
-        """Yield the messages of the wanted topics.
+        """Yield the messages of the requested topics.
 
         Raises:
             InputError: a file is not of the format that its name states, or a library is missing.
@@ -191,7 +192,7 @@ def _decompress(data: bytes, compression: str, size: int) -> bytes:
             return bz2.decompress(data)
     except InputError:
         raise
-    except Exception as error:  # each library has error types of its own
+    except Exception as error:  # each library has other error types
         raise _Damage(f"a compressed chunk is damaged ({str(error)[:80]})") from None
     if compression in ("", "none"):
         return data
@@ -216,7 +217,7 @@ def _read_mcap(path: Path, add: _Add) -> _Records:
             if code == _DATA_END:
                 return
             if code not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
-                file.seek(size, 1)
+                file.seek(min(size, _MAX_FILE_BYTES), 1)
                 continue
             data = _read_exactly(file, size)
             if code == _CHUNK:
@@ -246,6 +247,8 @@ def _read_mcap_records(data: bytes, schemas: dict[int, tuple[str, str, bytes]], 
             at += _RECORD_HEAD.size
             if code == _MESSAGE:
                 channel, _, received, _ = _MESSAGE_HEAD.unpack_from(data, at)
+                if received >= _MAX_STAMP:
+                    raise _Damage("a record is damaged")
                 yield channel, received, view[at + _MESSAGE_HEAD.size : at + size]
             elif code == _SCHEMA:
                 name, place = _read_text(data, at + 2)

@@ -26,7 +26,7 @@ from hydrotele.machine.log_columns import SKIP_COLUMN, LogColumn
 
 _MAX_STEP_RATIO = 1.5  # a group whose median step is longer than this multiple of that of the rows is slower
 _MAX_DISTANCE_RATIO = 0.75  # of the median step of a group: between 0.5, in a full sequence, and 1, at a missing sample
-_MAX_SPARSE_FRACTION = 0.5  # of the rows of a group: a column with values in at most so many has times of its own
+_MAX_SPARSE_FRACTION = 0.5  # of the rows of a group: a column with values in fewer rows has separate times
 _MAX_STEP_BACK = 1.0  # [s] of stamps: longer than any delay by which messages overtake each other
 _HELD_KINDS = ("command", "valid", "reference")
 
@@ -126,7 +126,7 @@ def import_log(
         names.append(channel)
         values.append(placed)
         units.append(item.unit)
-        known, missing = _known(item), float(np.mean(~np.isfinite(placed)))
+        known, missing = _drop_missing_values(item), float(np.mean(~np.isfinite(placed)))
         rate = 1.0 / _median_step(known.time) if len(known.time) > 1 else 0.0
         report.channels.append(ChannelReport(channel, item.key, len(known.time), rate, placement, missing))
     if (origin := recordings[0].origin) is not None:
@@ -149,7 +149,7 @@ def parse_channel_kind(channel: str) -> str:
 
 
 def _read_with_channel_names(path: Path, wanted: set, times: Mapping[str, LogColumn]) -> Recording:
-    """Read the wanted columns of a recording, and those of a table or MATLAB file that are named like channels."""
+    """Read the requested columns of a recording, and those of a table or MATLAB file that are named like channels."""
     recording = read_recording(path, wanted, times)
     own = {name for name in recording.ignored if name not in wanted and parse_channel_kind(name) != name}
     own |= {name for name in recording.ignored if name in ("mask", "valid", "pressure_supply")}
@@ -194,12 +194,14 @@ def _collect_series(recordings: Sequence[Recording], columns: Mapping[str, LogCo
             minus = group.columns[entry.minus]
         elif entry.minus:
             place = found[entry.minus]
-            other = _sort(_known(_Series("", entry, "", times[place], groups[place].columns[entry.minus])))
+            other = _sort_by_time(
+                _drop_missing_values(_Series("", entry, "", times[place], groups[place].columns[entry.minus]))
+            )
             minus = np.interp(times[label], other.time, other.value)
         unit = entry.unit or group.units.get(key)
         series.append(_Series(key, entry, label, times[label], entry.convert(values, minus), unit))
         if np.isfinite(values).mean() <= _MAX_SPARSE_FRACTION:
-            series[-1] = _known(series[-1])._replace(group=f"{label} {key}")
+            series[-1] = _drop_missing_values(series[-1])._replace(group=f"{label} {key}")
     return series
 
 
@@ -314,7 +316,7 @@ def _note_unaligned_recordings(series: list[_Series], shifts, starts: Mapping[st
 
 def _estimate_offset(main: _Series, other: _Series) -> float | None:
     clocks = []
-    for item in map(_sort, map(_known, (main, other))):
+    for item in map(_sort_by_time, map(_drop_missing_values, (main, other))):
         if len(item.time) < 2:
             return None
         try:
@@ -325,13 +327,13 @@ def _estimate_offset(main: _Series, other: _Series) -> float | None:
     return estimate_clock_offset(*clocks)
 
 
-def _known(item: _Series) -> _Series:
+def _drop_missing_values(item: _Series) -> _Series:
     """Return a series without missing values."""
     known = np.isfinite(item.value) & np.isfinite(item.time)
     return item if known.all() else item._replace(time=item.time[known], value=item.value[known])
 
 
-def _sort(item: _Series) -> _Series:
+def _sort_by_time(item: _Series) -> _Series:
     """Return a series with increasing times; of values with the same time the last one is used."""
     if (np.diff(item.time) > 0.0).all():
         return item
@@ -353,7 +355,7 @@ def _place_on_rows(rows: np.ndarray, item: _Series, held: bool) -> tuple[np.ndar
     """
     if item.time is rows or np.array_equal(item.time, rows):
         return item.value, "rows"
-    known = _sort(_known(item))
+    known = _sort_by_time(_drop_missing_values(item))
     if held:
         middle = rows + 0.5 * _median_step(rows)  # a value is held until the next row
         latest = np.searchsorted(known.time, middle, side="right") - 1

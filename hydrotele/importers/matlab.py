@@ -1,7 +1,7 @@
 """Read the numbers of MATLAB files: plain vectors with a time vector, and structures with their own time.
 
 Files of versions 5 to 7 are read with SciPy, those of version 7.3, which are HDF5 files, with h5py; only the
-columns that are asked for are read from the latter. A column has the name of its variable, with fields and
+requested columns are read from the latter. A column has the name of its variable, with fields and
 elements behind it: `boom.angle`, `capture.Y[Boom Angle].Data`, `signals[0].values[1]` for the second
 column of a matrix.
 """
@@ -48,8 +48,11 @@ def read_matlab(path: Path, columns: Collection[str] | None, times: Mapping[str,
         try:
             with h5py.File(path, "r") as file:
                 return _make_recording(path, _hdf5_to_tree(file, file), columns, times)
-        except OSError as error:
-            raise InputError(path, f"is a damaged MATLAB 7.3 file ({error}): copy it again") from None
+        except InputError:
+            raise
+        except Exception as error:  # a damaged file raises errors of many types
+            reason = str(error)[:100]
+            raise InputError(path, f"is a damaged MATLAB 7.3 file ({reason}): copy it again") from None
     tree, others = _read_version5(path, columns, times)
     recording = _make_recording(path, tree, columns, times)
     recording.ignored |= others

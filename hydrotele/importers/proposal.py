@@ -1,7 +1,7 @@
 """Propose a mapping of the columns of a recording to channels, from names, units and ranges of values.
 
 Each proposed line has a confidence: the mean of three parts, for the axis, the kind of channel and the
-unit. A part is 1 if the name or the file states it, and 0.5 if it is a guess. Columns that are not
+unit. A part is 1 if the name or the file states it, and 0.5 if it is estimated. Columns that are not
 recognised, and those whose channel another column has with a higher confidence, are written as comments.
 """
 
@@ -132,13 +132,13 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
     channel = found if found == "pressure_supply" else f"{found}.{axis}"
     stated, sure_unit, why = _find_unit(channel, words, kind, unit, low, high)
     parts = [sure_kind, sure_unit] if found == "pressure_supply" else [sure_axis, sure_kind, sure_unit]
-    guesses = [name for name, sure in (("axis", sure_axis), ("kind", sure_kind)) if sure < 1.0 and sure > 0.0]
-    reason = ", ".join([*(f"{name} guessed" for name in guesses), why, span])
+    estimated = [name for name, sure in (("axis", sure_axis), ("kind", sure_kind)) if 0.0 < sure < 1.0]
+    reason = ", ".join([*(f"{name} estimated" for name in estimated), why, span])
     return Proposal(column, channel, stated, None, sum(parts) / len(parts), reason)
 
 
 def _find_kind(words: Sequence[str], kind: str, unit: str | None) -> tuple[str | None, float]:
-    """Return the kind of channel that a column means, and 1 if its words state it, 0.5 for a guess.
+    """Return the kind of channel that a column means, and 1 if its words state it, 0.5 if it is estimated.
 
     Args:
         words: words of the name.
@@ -164,7 +164,7 @@ def _find_kind(words: Sequence[str], kind: str, unit: str | None) -> tuple[str |
 
 
 def _find_axis(words: Sequence[str], machine: Machine | None) -> tuple[str, float]:
-    """Return the axis that the words of a column mean ("" if none), and 1 if they state it, 0.5 for a guess."""
+    """Return the axis that the words of a column mean ("" if none), and 1 if they state it, 0.5 if it is estimated."""
     names = list(machine.axes) if machine else list(AXIS_NAMES)
     joints = {name: machine.axes[name].joint for name in names} if machine else {}
     text = "_".join(words)
@@ -185,7 +185,7 @@ def _find_axis(words: Sequence[str], machine: Machine | None) -> tuple[str, floa
 def _find_unit(
     channel: str, words: Sequence[str], kind: str, unit: str | None, low: float, high: float
 ) -> tuple[str | None, float, str]:
-    """Return (unit to state, 1 if it is stated or 0.5 for a guess from the range, reason)."""
+    """Return (unit to state, 1 if it is stated or 0.5 if the range suggests it, reason)."""
     allowed, size = allowed_channel_units(channel), max(abs(low), abs(high))
     if unit and si_unit_and_factor(unit)[0] in allowed:
         return None, 1.0, "unit stated by the file"
@@ -195,15 +195,15 @@ def _find_unit(
     if kind.startswith("sensor_msgs/") and (allowed[0] != "rad" or size <= 4 * np.pi):
         return None, 1.0, "SI by the type of the messages"
     if "Pa" in allowed:
-        guess = "Pa" if size > 2e4 else "psi" if size > 1e3 else "bar" if size > 60.0 else "MPa"
-        return guess, 0.5, "unit guessed from the range"
+        likely = "Pa" if size > 2e4 else "psi" if size > 1e3 else "bar" if size > 60.0 else "MPa"
+        return likely, 0.5, "unit estimated from the range"
     if allowed[0] == "rad":
-        return ("deg" if size > 4 * np.pi else "rad"), 0.5, "unit guessed from the range"
+        return ("deg" if size > 4 * np.pi else "rad"), 0.5, "unit estimated from the range"
     if allowed[0] == "m":
-        return ("mm" if size > 10.0 else "m"), 0.5, "unit guessed from the range"
+        return ("mm" if size > 10.0 else "m"), 0.5, "unit estimated from the range"
     if channel.startswith("command."):
-        guess = "1" if size <= 1.001 else "mA" if low >= 3.5 and high <= 21.0 else "V" if size <= 10.0 else "%"
-        return guess, 0.5, "unit guessed from the range"
+        likely = "1" if size <= 1.001 else "mA" if low >= 3.5 and high <= 21.0 else "V" if size <= 10.0 else "%"
+        return likely, 0.5, "unit estimated from the range"
     return None, 0.5, "unit taken as SI"
 
 
@@ -219,7 +219,7 @@ def _pair_one_sided_columns(proposals: Sequence[Proposal]) -> list[Proposal]:
             if len(one) == len(two) and len(differing) == 1 and differing[0] in _OPPOSITE_WORDS:
                 result.remove(second)
                 joined = first._replace(minus=second.column, confidence=min(first.confidence, 0.5))
-                result[result.index(first)] = joined._replace(reason=f"sign guessed, {first.reason}")
+                result[result.index(first)] = joined._replace(reason=f"sign estimated, {first.reason}")
     return result
 
 

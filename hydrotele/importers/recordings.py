@@ -1,7 +1,7 @@
 """Recordings: the columns of a log of another program, in groups with a common time.
 
 `read_recording` reads bags, MATLAB files, and CSV and Parquet files. A group is a topic of a bag, a structure
-of a MATLAB file, or a table. Only the columns that are asked for are kept in memory.
+of a MATLAB file, or a table. Only the requested columns are kept in memory.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""Mapping of the columns of foreign logs to channels (`log_columns` of a machine file, or a file beside the logs).
+"""Mapping of the columns of foreign logs to channels (`log_columns` of a machine file, or a file in their folder).
 
 An entry maps a column, or a field of a message, to a channel and states how its values are converted:
 
@@ -21,7 +21,7 @@ from hydrotele.core.errors import InputError
 
 SKIP_COLUMN = "none"  # channel of columns to skip
 LOG_COLUMNS_FILE = "log_columns.yaml"
-"""Name of the file beside the logs that maps their columns; it has precedence over the machine file."""
+"""Name of the file in the folder of logs that maps their columns; it has precedence over the machine file."""
 
 _SHORT_FORM = re.compile(r"(?P<minus>-?)\s*(?P<channel>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 
