@@ -17,7 +17,8 @@ import numpy as np
 
 import hydrotele
 from hydrotele.core.errors import InputError
-from hydrotele.importers.recordings import Group, Recording, read_recording
+from hydrotele.importers.readers import read_recording
+from hydrotele.importers.recordings import Group, Recording
 from hydrotele.logs.clock import estimate_clock_offset, fit_clock
 from hydrotele.logs.log import CommandRange, Log, convert_mask_column, make_log, normalise_commands
 from hydrotele.logs.table import Table

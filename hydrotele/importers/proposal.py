@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.units import UNITS, canonical_unit, si_unit_and_factor
-from hydrotele.importers.recordings import Recording, read_recording
+from hydrotele.importers.readers import read_recording
+from hydrotele.importers.recordings import Recording
 from hydrotele.machine.log_channels import allowed_channel_units, parse_channel
 from hydrotele.machine.machine import Machine
 
