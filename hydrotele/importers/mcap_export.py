@@ -2,7 +2,8 @@
 
 Joint positions and velocities are `sensor_msgs/msg/JointState` in the topic `/joint_states`, pressures
 `sensor_msgs/msg/FluidPressure` in topics such as `/pressure_head/boom`, and all other channels
-`std_msgs/msg/Float64` in topics such as `/command/boom`, each in SI units. Missing values are not written.
+`std_msgs/msg/Float64` in topics such as `/command/boom`, each in SI units. Missing values and the
+channels `truth.*` of a simulator are not written.
 """
 
 import os
@@ -46,7 +47,7 @@ def write_mcap(log: Log, path: Path) -> int:
     Raises:
         InputError: the file cannot be written, or the library is missing.
     """
-    mcap = import_library("mcap.writer")
+    mcap, log = import_library("mcap.writer"), log.without_truth()
     stamps = np.rint((log.origin + log.time - min(log.origin + log.time[0], 0.0)) * 1e9).astype(np.int64)
     joints = _find_joints(log)
     others = [name for name in log.columns if name not in {c for names in joints.values() for c in names if c}]
@@ -98,7 +99,7 @@ def _find_joints(log: Log) -> dict[str, tuple[str, str]]:
     joints: dict[str, tuple[str, str]] = {}
     for name in log.columns:
         channel = parse_channel(name)
-        if channel.kind in ("angle", "position") and not channel.truth:
+        if channel.kind in ("angle", "position"):
             velocity = f"velocity.{channel.axis}"
             joints[channel.axis] = name, velocity if velocity in log.columns else ""
     return joints

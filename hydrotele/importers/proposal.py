@@ -123,6 +123,8 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
         return Proposal(column, channel, None, None, 1.0, f"is named like a channel, {span}")
     except ValueError:
         words = _split_words(column)
+    if "truth" in words:
+        return Proposal(column, None, None, None, 0.0, f"is not measured, {span}")
     found, sure_kind = _find_kind(words, kind, unit)
     axis, sure_axis = _find_axis(words, machine)
     if not found or (not axis and found != "pressure_supply"):

@@ -1,5 +1,6 @@
 """Import of CSV dialects and MATLAB files, proposed mappings, and export to MCAP."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -242,7 +243,8 @@ def make_log(gap=True):
 
 def test_export_and_import_return_the_same_log(tmp_path):
     log = make_log()
-    assert write_mcap(log, tmp_path / "a.mcap") == 500 + 500 + 250
+    truth = {"columns": {**log.columns, "truth.angle.boom": BOOM}, "units": {**log.units, "truth.angle.boom": "rad"}}
+    assert write_mcap(dataclasses.replace(log, **truth), tmp_path / "a.mcap") == 500 + 500 + 250  # without the truth
     columns = {p.column: parse_log_column(f"{p.channel}") for p in propose_mapping(tmp_path / "a.mcap")
                if p.channel and p.confidence}  # fmt: skip
     columns["/joint_states.position[slide]"] = parse_log_column("position.slide")
