@@ -30,6 +30,7 @@ FLOORS = (
     ("run",),
     ("calibrate", "gap"),
     ("experiments",),
+    ("importers",),
     ("show",),
     ("envs",),
     ("cli",),

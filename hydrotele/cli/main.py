@@ -634,6 +634,59 @@ def export(
     export_machine(machine, tool, out, picture, camera)
 
 
+IMPORT_EPILOG = """\b
+Examples:  hydrotele import field.mcap --write-mapping field.yaml --machine my_excavator
+           hydrotele import field.mcap --mapping field.yaml --machine my_excavator --out logs
+           hydrotele import bag_folder sensors.mat --merge --out run_1.parquet
+
+\b
+Reads ROS 1 bags (.bag), ROS 2 bags (folder, .db3, .mcap), plain MCAP, MATLAB files (.mat), CSV
+dialects and Parquet. The mapping is `log_columns` of the machine, or of log_columns.yaml next to the
+log, or of --mapping: source column or topic path to channel, unit, scale, sign, offset, wrap, minus.
+Needs pip install 'hydrotele[import]' for bags and MATLAB 7.3.
+"""
+
+
+@app.command("import", epilog=IMPORT_EPILOG)
+def import_(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of other programs.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Parquet file, or folder for several logs; default: the current folder."),
+    ] = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    mapping: Annotated[Path | None, typer.Option("--mapping", help="YAML file with log_columns.")] = None,
+    write_mapping: Annotated[
+        Path | None,
+        typer.Option("--write-mapping", metavar="FILE.yaml", help="Only propose a mapping of the first log."),
+    ] = None,
+    merge: Annotated[bool, typer.Option("--merge", help="All logs belong to one run.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Convert ROS bags, MCAP, MATLAB and CSV files to logs that all commands read."""
+    from hydrotele.cli import import_command
+
+    if write_mapping:
+        import_command.write_mapping(logs[0], write_mapping, machine, tool)
+        return
+    import_command.import_logs(logs, out, machine, tool, mapping, merge, json)
+
+
+@app.command("export-log", epilog="Example:  hydrotele export-log runs/zhu_up --mcap zhu_up.mcap")
+def export_log(
+    log: Annotated[Path, typer.Argument(help="Log file, folder with one log, or run folder.")],
+    mcap: Annotated[Path, typer.Option("--mcap", help="MCAP file to write.")],
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Write a log as an MCAP file of standard messages for Foxglove, PlotJuggler and rerun."""
+    from hydrotele.cli import import_command
+
+    import_command.export_log(log, mcap, machine, tool, force)
+
+
 @app.command(epilog="Example:  hydrotele experiments zhu1994 --json")
 def experiments(
     name: Annotated[

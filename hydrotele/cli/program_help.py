@@ -44,6 +44,8 @@ COMMAND_GROUPS = {
         "list": "List the available machines, scenarios, sweeps, effects and environments.",
         "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and line.",
         "export": "Write the complete MJCF of a machine or joystick, or an image of it.",
+        "import": "Convert ROS bags, MCAP, MATLAB and CSV files to logs that all commands read.",
+        "export-log": "Write a log as an MCAP file of standard messages for Foxglove, PlotJuggler and rerun.",
     },
     "Installation": {
         "compile": "Compile all numerical functions now, so that later commands start without delay.",

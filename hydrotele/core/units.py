@@ -60,6 +60,8 @@ _SPELLINGS = {
     "l/min": "L/min", "lpm": "L/min", "degree": "deg", "degrees": "deg", "percent": "%",
 }  # fmt: skip
 
+_SI_UNITS = frozenset({si for si, _ in UNITS.values()} | {"mA"})
+
 KEY_SUFFIXES: Mapping[str, str] = {
     "_deg": "deg", "_mm": "mm", "_in2": "in^2", "_cm2": "cm^2", "_psi": "psi", "_bar": "bar",
     "_hz": "Hz", "_l_min": "L/min", "_ms": "ms",
@@ -114,6 +116,16 @@ def si_unit_and_factor(unit: str) -> tuple[str, float]:
     """
     unit = canonical_unit(unit)
     return UNITS.get(unit, (unit, 1.0))
+
+
+def is_known_unit(text: str) -> bool:
+    """Return whether a text is a unit that has a conversion to SI, or the SI unit of one.
+
+    >>> is_known_unit("bar"), is_known_unit("V"), is_known_unit("boom")
+    (True, True, False)
+    """
+    unit = canonical_unit(text)
+    return unit in UNITS or unit in _SI_UNITS
 
 
 def plot_axis_unit(unit: str) -> tuple[str, float]:

@@ -25,6 +25,7 @@ from hydrotele.logs.masked_intervals import MaskedInterval, check_mask_runs, rea
 from hydrotele.logs.resampling import RunRows, average_rows, merge_run, slice_rows
 from hydrotele.logs.run_files import RunFiles, check_commands, read_runs
 from hydrotele.machine.log_channels import parse_channel
+from hydrotele.machine.log_columns import LogColumn
 from hydrotele.machine.machine import IDEAL_SENSORS, Machine, find_channel_sensor, get_sensor_set, reading_noise_rms
 from hydrotele.machine.sensors import SensorSet
 
@@ -489,7 +490,7 @@ def load_dataset(
     machine: Machine,
     sensors: str | None = None,
     heldout: str | None = None,
-    aliases: Mapping[str, str] | None = None,
+    aliases: Mapping[str, str | LogColumn] | None = None,
     *,
     force: bool = False,
     mask: str | Path | None = None,

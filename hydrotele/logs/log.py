@@ -28,6 +28,7 @@ from hydrotele.machine.log_channels import (
     plausible_magnitude_limits,
     suggest_channel_names,
 )
+from hydrotele.machine.log_columns import SKIP_COLUMN, LogColumn, log_columns_for
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -186,10 +187,18 @@ def _to_si_units(table: Table) -> Table:
             unit, factor = si_unit_and_factor(stated)
         allowed = allowed_channel_units(name)
         if unit not in allowed:
+            remedy = "correct the unit, or rename the column to a channel with this unit"
+            if name.startswith("command."):
+                axis = name.removeprefix("command.")
+                remedy = (
+                    "correct the unit, state the range in the machine file, such as"
+                    f" axes.{axis}: {{command_unit: {stated}, command_range: [-30, 30]}}, or give `scale` and unit 1 in"
+                    " log_columns"
+                )
             raise InputError(
                 table.location(name),
                 f"has the unit {stated!r}; a log needs {' or '.join(allowed)}, to which it cannot be converted:"
-                " correct the unit, or rename the column to a channel with this unit",
+                f" {remedy}",
             )
         columns.append(values if factor == 1.0 else values * factor)
         units.append(unit)
@@ -257,9 +266,6 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
     if _DEAD_SENSOR_PRESSURE < size.max() < limits.min_magnitude:
         row = int(np.argmax(size))
         raise InputError(table.location(name, row), f"never exceeds {size[row]:g}: {remedy}")
-
-
-SKIP_COLUMN = "none"  # alias of columns to skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,7 +384,7 @@ def find_log_in_folder(folder: Path, stem: str = MEASURED_STEM) -> Path | None:
 def load_log(
     path: str | os.PathLike,
     *,
-    aliases: Mapping[str, str] | None = None,
+    aliases: Mapping[str, str | LogColumn] | None = None,
     required: Sequence[str] = (),
     minimum_rows: int = 10,
     complete: bool = False,
@@ -391,10 +397,10 @@ def load_log(
 
     Args:
         path: the file, or the folder of a run, whose measured log is read.
-        aliases: column name in the file -> channel name. A minus before the channel name inverts
-            the sign; a unit may follow it, as in `-angle.boom [deg]`. The column name `a * b` means
-            the product of two columns without unit. The channel name `none` skips a column. Unknown
-            column names are ignored. Logs written by hydrotele need no aliases and ignore them.
+        aliases: column name in the file -> channel, as a text or with a conversion, see
+            `machine.log_columns`. The column name `a * b` means the product of two columns without
+            unit. Unknown column names are ignored. The file `log_columns.yaml` in the folder of the
+            log adds aliases. Logs written by hydrotele need no aliases and ignore them.
         required: channels that must be present after renaming.
         minimum_rows: minimum number of rows.
         complete: refuse empty cells and time stamps that need a repair, for tables of commands.
@@ -415,14 +421,22 @@ def load_log(
         path = found
     table = read_table(path, missing=True)
     if "hydrotele" not in table.metadata:
-        table = convert_mask_column(_apply_aliases(table, aliases or {}))
-        table = normalise_commands(table, commands or {})
+        table = _apply_aliases(table, log_columns_for(path, aliases or {}))
+        table = normalise_commands(convert_mask_column(table), commands or {})
+    return make_log(table, required, minimum_rows, complete)
+
+
+def make_log(table: Table, required: Sequence[str] = (), minimum_rows: int = 10, complete: bool = False) -> Log:
+    """Make a log from a table with channel names: check it, convert it to SI units and repair its time stamps.
+
+    The arguments and errors are those of `load_log`.
+    """
     for name in table.names:
         if name in table.faults:
             raise table.faults[name]
     rows, needed = len(table.values[0]) if table.names else 0, max(minimum_rows, 2)
     if rows < needed:
-        raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
+        raise InputError(table.source, f"the run is too short: {rows} rows, {needed} are needed")
     table = check_and_convert_table(table, required)
     if complete:
         check_finite_and_ordered(table)
@@ -431,15 +445,18 @@ def load_log(
     units = dict(zip(table.names, map(str, table.units), strict=True))
     time = columns.pop("time")
     del units["time"]
-    return Log(time, columns, units, table.metadata, str(path), origin, notes)
+    return Log(time, columns, units, table.metadata, table.source, origin, notes)
 
 
-def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
-    """Rename the columns of a table by aliases, which may also invert, multiply or skip columns.
+def _apply_aliases(table: Table, aliases: Mapping[str, LogColumn]) -> Table:
+    """Rename and convert the columns of a table by aliases, which may also combine or skip columns.
 
     Args:
         table: table with the column names of the file.
-        aliases: column name -> channel; see `load_log`.
+        aliases: column name -> channel and conversion; see `load_log`.
+
+    Raises:
+        InputError: an alias contradicts the unit of the file, or subtracts a column that the file does not have.
     """
     for product in aliases:
         factors = product.split(" * ")
@@ -448,18 +465,29 @@ def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
             table = table._replace(
                 names=[*table.names, product], values=[*table.values, a * b], units=[*table.units, None],
             )  # fmt: skip
-    by_name = {parse_label(name)[0]: channel for name, channel in aliases.items()} | dict(aliases)
+    by_name = {parse_label(name)[0]: alias for name, alias in aliases.items()} | dict(aliases)
+    subtracted = {parse_label(alias.minus)[0] for name, alias in by_name.items() if alias.minus and name in table.names}
+    if missing := sorted(subtracted - set(table.names)):
+        has = ", ".join(table.names)
+        raise InputError(table.source, f"has no column {missing[0]!r}, which log_columns subtracts; it has {has}")
     names, values, units, faults = [], [], [], {}
     for name, column, unit in zip(table.names, table.values, table.units, strict=True):
-        channel, stated = parse_label(by_name[name]) if name in by_name else (name, None)
-        if channel == SKIP_COLUMN:
+        alias = by_name.get(name, LogColumn(channel=SKIP_COLUMN if name in subtracted else name))
+        if alias.channel == SKIP_COLUMN:
             continue
-        if stated and unit and canonical_unit(stated) != canonical_unit(unit):
-            message = f"has the unit {unit!r}, but log_columns states {stated!r}: remove the wrong unit"
+        if alias.unit and unit and canonical_unit(alias.unit) != canonical_unit(unit) and alias.scale == 1.0:
+            message = f"has the unit {unit!r}, but log_columns states {alias.unit!r}: remove the wrong unit"
             raise InputError(table.location(name), message)
-        names.append(channel.removeprefix("-"))
-        values.append(-column if channel.startswith("-") else column)
-        units.append(stated or unit)
+        minus = None
+        if alias.minus:
+            place = table.names.index(parse_label(alias.minus)[0])
+            minus = table.values[place]
+            if table.units[place] and unit and canonical_unit(str(table.units[place])) != canonical_unit(unit):
+                message = f"has the unit {unit!r}, but {alias.minus}, which is subtracted, has {table.units[place]!r}"
+                raise InputError(table.location(name), f"{message}: write both in the same unit")
+        names.append(alias.channel)
+        values.append(alias.convert(column, minus))
+        units.append(alias.unit or unit)
         if name in table.faults:
             faults[names[-1]] = table.faults[name]
     return table._replace(names=names, values=values, units=units, faults=faults)
@@ -468,7 +496,7 @@ def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
 def load_logs(
     path: str | os.PathLike,
     *,
-    aliases: Mapping[str, str] | None = None,
+    aliases: Mapping[str, str | LogColumn] | None = None,
     required: Sequence[str] = (),
     minimum_rows: int = 10,
 ) -> tuple[Log, ...]:
@@ -513,8 +541,10 @@ def find_logs(path: Path) -> list[tuple[str, Path]]:
     return files
 
 
-def save_log(log: Log, path: str | os.PathLike) -> None:
+def save_log(log: Log, path: str | os.PathLike, *, missing: bool = False) -> None:
     """Write a log to a Parquet file, which an error during writing leaves unchanged if it exists.
+
+    `missing` allows NaN for readings that are missing.
 
     Raises:
         InputError: a value is not finite, time does not increase, the name does not end in
@@ -523,6 +553,9 @@ def save_log(log: Log, path: str | os.PathLike) -> None:
     path = Path(path)
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]
     table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
+    if missing:
+        _check_finite(table, missing=True)
+        table = table._replace(names=names[:1], values=values[:1])
     check_finite_and_ordered(table)
     content = _parquet_bytes(log.to_arrow())
     with atomic_file(path, ".parquet") as part, open(part, "xb") as file:

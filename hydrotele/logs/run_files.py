@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import CommandRange, Log, find_logs, load_log
+from hydrotele.machine.log_columns import LogColumn
 from hydrotele.machine.machine import Machine
 
 
@@ -24,7 +25,7 @@ class RunFiles(NamedTuple):
 
 
 def read_runs(
-    paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str], force: bool,
+    paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str | LogColumn], force: bool,
     keep_truth: bool = False,
 ) -> tuple[RunFiles, ...]:  # fmt: skip
     """Read all logs and group them into runs.

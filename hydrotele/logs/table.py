@@ -5,6 +5,7 @@ not a number does not stop the reader: the column then has a fault, which is rep
 is used.
 """
 
+import codecs
 import csv
 import datetime
 import io
@@ -13,19 +14,26 @@ import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_limit, get_limit, open_regular
+from hydrotele.core.units import is_known_unit
 
 DATE_UNIT = "date"
 """Unit of a column of dates; its values are seconds since its first date."""
 
 _MAX_CHARACTERS_PER_COLUMN = 100  # times the limit of columns: longest line that is read
+_MAX_LINES_BEFORE_DATA = 200  # lines in which the first row is sought
+_ENCODING_BYTES = 2**20  # bytes from which the encoding is determined
+_CONTROL_BYTES = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _LABEL = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 _COMMENT_MARKS = ("#", "%", "//")
+_PARENTHESES = re.compile(r"(?P<name>.*?)\s*\((?P<unit>[^()]*)\)", re.DOTALL)
+_DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})[ T]+(\d{1,2}:\d{2}(?::\d{2})?(?:[.,]\d+)?)\s*([AaPp][Mm])?")
+_TIME_OF_DAY = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?(?:[.,](\d+))?\s*([AaPp][Mm])?")
 _MISSING_WORDS = frozenset({"", "na", "n/a", "null", "none"})
 _DECIMAL_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+(\.\d*)?")
@@ -66,11 +74,14 @@ def format_location(source: str, column: str, row: int | None, lines: Sequence |
 
 
 def parse_label(text: str) -> tuple[str, str | None]:
-    """Split a column label into name and unit.
+    """Split a column label into name and unit. A unit in parentheses must be a known one.
 
-    >>> parse_label("angle.boom [deg]"), parse_label("time")
-    (('angle.boom', 'deg'), ('time', None))
+    >>> parse_label("angle.boom [deg]"), parse_label("Boom (bar)"), parse_label("time")
+    (('angle.boom', 'deg'), ('Boom', 'bar'), ('time', None))
     """
+    match = _PARENTHESES.fullmatch(text.strip())
+    if match and match["unit"].strip() != "1" and is_known_unit(match["unit"]):  # `Sensor (1)` is a number
+        return match["name"], match["unit"].strip()
     match = _LABEL.fullmatch(text.strip())
     return (match["name"], (match["unit"] or "").strip() or None) if match else (text, None)
 
@@ -131,14 +142,18 @@ def read_csv(path: Path, missing: bool = False) -> Table:
     """Read a CSV log: a header of `name` or `name [unit]`, then one line of numbers per row.
 
     Accepted forms:
+    - Lines before the header, as LabVIEW and other loggers write them, are ignored; the header is then
+        the last line of names above the first row that begins with a number or a date.
+    - A line of units below the header, such as `s;bar;deg`, states the units of the columns.
     - Columns are separated by comma, semicolon or tab. It is the most frequent of these in the
       header, or the one that a first line such as `sep=;` states. Separators at the end of a line,
       and lines of separators only, are ignored.
     - Numbers have a decimal point or a decimal comma, the same in the whole file. With commas
       between the columns, numbers with a decimal comma must be in quotation marks.
     - Lines that begin with `#`, `%`, `//` or `;` are comments; `# key: value` is read as metadata.
-    - A column of ISO dates, or of times such as `12:30:05.020`, is read as seconds since its first
-    row.
+    - A column of ISO dates, of dates such as `31.12.2024 12:30:05,020` or `12/31/2024 1:30:05 PM`, or of
+        times such as `12:30:05.020`, is read as seconds since its first row.
+    - The text is UTF-8, UTF-16 with a byte order mark, or Windows-1252.
 
     Args:
         path: the file.
@@ -146,7 +161,7 @@ def read_csv(path: Path, missing: bool = False) -> Table:
             as `faults` of the table. If False, both raise an InputError.
 
     Raises:
-        InputError: the file is not UTF-8 text, is empty, has no header, has a row of the wrong
+        InputError: the file is no text, is empty, has no header, has a row of the wrong
             length, or contains a cell that is not a number.
     """
     read = _CsvReader(str(path), missing)
@@ -156,17 +171,34 @@ def read_csv(path: Path, missing: bool = False) -> Table:
 
 
 def _iterate_lines(path: Path, max_line: int) -> Iterator[tuple[int, str]]:
-    """Yield (line number from 1, line) of a UTF-8 text file without holding all lines in memory.
+    """Yield (line number from 1, line) of a text file without holding all lines in memory.
 
     A line of more than `max_line` characters is yielded in parts of this length.
     """
     with open_regular(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8-sig")
+        text = io.TextIOWrapper(file, encoding=_find_encoding(file))
         try:
             yield from enumerate(iter(lambda: text.readline(max_line), ""), 1)
         except UnicodeDecodeError as error:
             reason = f"is not text in UTF-8 ({error.reason}): save it as CSV UTF-8"
             raise InputError(path, reason) from error
+
+
+def _find_encoding(file: BinaryIO) -> str:
+    """Return the encoding of a text file from its first bytes; text that is not UTF-8 counts as Windows-1252.
+
+    The result is UTF-8 for files with control characters, which are no text.
+    """
+    head = file.read(_ENCODING_BYTES)
+    file.seek(0)
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        if not _CONTROL_BYTES.search(head):
+            return "cp1252"
+    return "utf-8-sig"
 
 
 class _CsvReader:
@@ -183,6 +215,7 @@ class _CsvReader:
         self.separator: str | None = None
         self.values, self.lines = array("d"), array("q")
         self._possible_header: str | None = None  # a line with `;` in front: comment or header
+        self._before_data: list[tuple[int, str]] = []  # lines until the first row is found
         self._first_dates: dict[int, datetime.datetime] = {}
         self._point: str | None = None  # location of the first number with a decimal point
         self._comma: str | None = None  # location of the first number with a decimal comma
@@ -221,6 +254,8 @@ class _CsvReader:
         if self._possible_header is not None:
             self._parse_comment(self._possible_header)
         if not self.names:
+            self._parse_lines_as_table()
+        if not self.names:
             reason = "is empty: write a header of channel names, then one line per row"
             raise InputError(self.source, reason)
         if self._comma and self._point:
@@ -252,6 +287,9 @@ class _CsvReader:
         if self.separator is None and (match := re.fullmatch(r"\s*\"?sep=(.)\"?\s*", line, re.IGNORECASE)):
             self.separator = match[1]
             return
+        if self._before_data:
+            self._seek_first_row(number, line)
+            return
         if (possible := self._possible_header) is not None:
             self._possible_header = None
             if self._is_row_below(possible, line):
@@ -262,7 +300,58 @@ class _CsvReader:
         if line.startswith(";"):
             self._possible_header = line
         else:
-            self._parse_header(line)
+            self._seek_first_row(number, line)
+
+    def _seek_first_row(self, number: int, line: str) -> None:
+        """Store a line before the first row; if it is the first row, parse the header above it, and the row.
+
+        The line above the first row has the same number of cells and no number. Only if it is the first
+        line of the file, it may have another number, which is reported. If no such row is found in 200
+        lines, the first line is the header.
+        """
+        before = self._before_data
+        if before and self._is_first_row(line):
+            units = len(before) > 1 and self._is_units_line(before[-1][1], before[-2][1])
+            header, place = before[-2 if units else -1][1], len(before) - (2 if units else 1)
+            separator = self.separator or _find_separator(header)
+            names, cells = _split_line(header, separator), _split_line(line, separator)
+            alike = _count_cells(names) == _count_cells(cells) or len(names) == len(cells)
+            if not any(map(_is_number, names)) and (place == 0 or (alike and len(cells) > 1)):
+                self._before_data = []
+                self._parse_header(header)
+                if units:
+                    stated = [_bare_unit(cell) or None for cell in _split_line(before[-1][1], separator)]
+                    stated += [None] * len(self.names)
+                    self.units = [own or unit for own, unit in zip(self.units, stated, strict=False)]
+                self._parse_row(number, line)
+                return
+        before.append((number, line))
+        if len(before) >= _MAX_LINES_BEFORE_DATA:
+            self._parse_lines_as_table()
+
+    def _is_first_row(self, line: str) -> bool:
+        """Return whether a line begins with a number, a date or an empty cell."""
+        separator = self.separator or _find_separator(self._before_data[-1][1])
+        text = _split_line(line, separator)[0].strip().strip('"').strip()
+        return bool(
+            _is_number(text) or text.lower() in _MISSING_WORDS or _DECIMAL_COMMA.fullmatch(text) or _parse_date(text)
+        )
+
+    def _is_units_line(self, line: str, header: str) -> bool:
+        """Return whether all cells of a line are known units or empty, and their number is that of the header."""
+        separator = self.separator or _find_separator(header)
+        cells = [_bare_unit(cell) for cell in _split_line(line, separator)]
+        known = [cell for cell in cells if cell]
+        return len(cells) == len(_split_line(header, separator)) and bool(known) and all(map(is_known_unit, known))
+
+    def _parse_lines_as_table(self) -> None:
+        """Parse the stored lines: the first one is the header, the others are rows."""
+        lines, self._before_data = self._before_data, []
+        for place, (number, line) in enumerate(lines):
+            if place == 0:
+                self._parse_header(line)
+            else:
+                self._parse_row(number, line)
 
     def _is_row_below(self, header: str, line: str) -> bool:
         """Return whether a line is a row of numbers or empty cells, with as many cells (at least 2) as the header."""
@@ -379,6 +468,16 @@ def _split_line(line: str, separator: str) -> list[str]:
         return line.split(separator)
 
 
+def _count_cells(cells: Sequence[str]) -> int:
+    """Return the number of cells without empty ones at the end."""
+    return max((place for place, cell in enumerate(cells, start=1) if cell.strip()), default=0)
+
+
+def _bare_unit(cell: str) -> str:
+    """Return a cell of a line of units without quotation marks and brackets."""
+    return cell.strip().strip('"').strip().strip("[]()").strip()
+
+
 def _is_number(text: str) -> bool:
     try:
         float(text)
@@ -388,15 +487,37 @@ def _is_number(text: str) -> bool:
 
 
 def _parse_date(text: str) -> datetime.datetime | None:
-    """Return an ISO date, or a time of day on an arbitrary date; None for other text."""
+    """Return an ISO date, a date with the day or month in front, or a time of day on an arbitrary date.
+
+    The result is None for other text. In `1/2/2024` the month is in front, in `1.2.2024` the day.
+
+    >>> _parse_date("31.12.2024 12:30:05,5"), _parse_date("1/2/2024 1:00 PM")
+    (datetime.datetime(2024, 12, 31, 12, 30, 5, 500000), datetime.datetime(2024, 1, 2, 13, 0))
+    """
     if ":" not in text and "-" not in text:
         return None
     try:
         return datetime.datetime.fromisoformat(text)
     except ValueError:
         pass
+    day = datetime.date(2000, 1, 1)
+    match = _DATE.fullmatch(text)
     try:
-        return datetime.datetime.combine(datetime.date(2000, 1, 1), datetime.time.fromisoformat(text))
+        if match:
+            first, second, third = int(match[1]), int(match[3]), int(match[4])
+            if len(match[1]) == 4:
+                day = datetime.date(first, second, third)
+            elif match[2] == "/" and first <= 12:
+                day = datetime.date(third, first, second)
+            else:
+                day = datetime.date(third, second, first)
+            text = f"{match[5]} {match[6] or ''}".strip()
+        clock = _TIME_OF_DAY.fullmatch(text)
+        if clock is None:
+            return None
+        hour = int(clock[1]) if clock[5] is None else int(clock[1]) % 12 + 12 * (clock[5].lower() == "pm")
+        micro = int(f"{clock[4] or '0':<06}"[:6])
+        return datetime.datetime.combine(day, datetime.time(hour, int(clock[2]), int(clock[3] or 0), micro))
     except ValueError:
         return None
 

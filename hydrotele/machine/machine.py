@@ -22,6 +22,7 @@ from hydrotele.core.datafile import (
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import describe_excess
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
+from hydrotele.machine.log_columns import LogColumnEntry
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet, make_channel_converter
 from hydrotele.terms.term import Term
 
@@ -202,7 +203,7 @@ class Machine(StrictModel):
     sensor_errors: dict[str, SensorError] = {}
     home: dict[Name, float] = {}
     arm: Arm | None = None
-    log_columns: dict[str, str] = {}
+    log_columns: dict[str, LogColumnEntry] = {}
     removed_bodies: tuple[str, ...] = ()
     uncertainty: dict[str, NonNegativeFloat] = {}
     terms: tuple[Term, ...] = ()
