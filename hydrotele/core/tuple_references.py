@@ -72,11 +72,8 @@ def argument_type(kind: Any) -> Any:
 
     Returns:
         A `Reference` for a large named tuple; the non-literal type for a constant, so that a
-        function is not compiled for each constant; the general type for an array in a record; otherwise `kind`
-        itself.
+        function is not compiled for each constant; otherwise `kind` itself.
     """
-    if isinstance(kind, types.NestedArray):
-        return types.Array(kind.dtype, kind.ndim, kind.layout, aligned=kind.aligned)
     if isinstance(kind, _NAMED_TUPLES) and count_native_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
         return Reference(kind)
     return types.unliteral(kind)
