@@ -105,8 +105,8 @@ def _compile_analyses() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         for line in (
-            f"run excitation --set duration=5 --no-review --out {folder}/logs/1",
-            f"run excitation --set duration=5 --set seed=1 --no-review --out {folder}/logs/2",
+            f"run excitation --set duration=20 --no-review --out {folder}/logs/1",
+            f"run excitation --set duration=20 --set seed=1 --no-review --out {folder}/logs/2",
             f"identify --data {folder}/logs --hydraulics --out {folder}/identified",
             f"calibrate hybrid --simulate {folder}/robot --poses 25",
             f"calibrate hybrid --data {folder}/robot --out {folder}/calibrated",
