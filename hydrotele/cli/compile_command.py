@@ -98,7 +98,6 @@ def _compile_gap() -> None:
 
 
 def _compile_analyses() -> None:
-    from hydrotele.cli.main import app
     from hydrotele.teleop.case_file import load_teleop_case
     from hydrotele.teleop.simulation_check import run_sine_sweep
     from hydrotele.teleop.stiffness_switching import worst_switching_growth
@@ -112,7 +111,7 @@ def _compile_analyses() -> None:
             f"calibrate hybrid --data {folder}/robot --out {folder}/calibrated",
             "analyse teleop press_direct --json",
         ):
-            app(line.split(), standalone_mode=False)
+            subprocess.run([sys.executable, "-P", "-m", "hydrotele", *line.split()], check=True)
     run_sine_sweep(load_teleop_case().to_axis(), "position_force", np.array([50.0]))
     worst_switching_growth(1.0, 0.0, 100.0, 400.0)
 
@@ -122,11 +121,14 @@ def _compile_haptics() -> None:
     from hydrotele.haptics.link import HapticLink
     from hydrotele.machine.joystick import load_joystick
     from hydrotele.scenario.scenario import load_scenario
+    from hydrotele.scenario.teleoperation import TeleopPilot
     from hydrotele.teleop.master import build_master
 
     SimulatedDevice(1.0e-3).read()
+    pilot = load_scenario("press_stiffness").pilot
+    assert isinstance(pilot, TeleopPilot)
+    master = build_master(load_joystick(), pilot, ("r", "theta", "z", "attitude"))
     link, packet = HapticLink("127.0.0.1", 9), np.zeros((8, 4))
-    master = build_master(load_joystick(), load_scenario("press_stiffness").pilot, ("r", "theta", "z", "attitude"))
     try:
         link.start(*master, packet.shape)
         link.exchange(np.zeros(7), packet, 1.0, np.zeros(6))

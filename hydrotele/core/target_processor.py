@@ -20,7 +20,7 @@ from numba.core import registry
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompileResult
-from numba.core.runtime import _nrt_python
+from numba.core.runtime import _nrt_python  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
 _V2 = ("cx16", "sahf", "popcnt", "sse3", "ssse3", "sse4.1", "sse4.2")
 _LEVELS = {
