@@ -15,6 +15,13 @@ import hydrotele
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.parametrize("module", ["hydrotele.envs.gymnasium_env", "hydrotele.cli.run_command"])
+def test_environments_and_runs_start_without_scipy_signal_and_rerun(module):
+    """Together they would take as long to import as all other modules."""
+    code = f"import sys, {module}; print([m for m in ('scipy.signal', 'scipy.optimize', 'rerun') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
 def test_every_public_name_is_there_and_has_a_docstring():
     for name in hydrotele.__all__:
         assert getattr(hydrotele, name).__doc__, name

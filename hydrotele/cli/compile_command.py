@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import typer
 
 import hydrotele
@@ -96,11 +97,53 @@ def _compile_gap() -> None:
         find_gap(data, effects=("valve_gain",), method="regression")
 
 
+def _compile_analyses() -> None:
+    from hydrotele.teleop.case_file import load_teleop_case
+    from hydrotele.teleop.simulation_check import run_sine_sweep
+    from hydrotele.teleop.stiffness_switching import worst_switching_growth
+
+    with tempfile.TemporaryDirectory() as folder:
+        for line in (
+            f"run excitation --set duration=20 --no-review --out {folder}/logs/1",
+            f"run excitation --set duration=20 --set seed=1 --no-review --out {folder}/logs/2",
+            f"identify --data {folder}/logs --hydraulics --out {folder}/identified",
+            f"calibrate hybrid --simulate {folder}/robot --poses 25",
+            f"calibrate hybrid --data {folder}/robot --out {folder}/calibrated",
+            "analyse teleop press_direct --json",
+        ):
+            subprocess.run([sys.executable, "-P", "-m", "hydrotele", *line.split()], check=True)
+    run_sine_sweep(load_teleop_case().to_axis(), "position_force", np.array([50.0]))
+    worst_switching_growth(1.0, 0.0, 100.0, 400.0)
+
+
+def _compile_haptics() -> None:
+    from hydrotele.haptics.device import SimulatedDevice
+    from hydrotele.haptics.link import HapticLink
+    from hydrotele.machine.joystick import load_joystick
+    from hydrotele.scenario.scenario import load_scenario
+    from hydrotele.scenario.teleoperation import TeleopPilot
+    from hydrotele.teleop.master import build_master
+
+    SimulatedDevice(1.0e-3).read()
+    pilot = load_scenario("press_stiffness").pilot
+    assert isinstance(pilot, TeleopPilot)
+    master = build_master(load_joystick(), pilot, ("r", "theta", "z", "attitude"))
+    link, packet = HapticLink("127.0.0.1", 9), np.zeros((8, 4))
+    try:
+        link.start(*master, packet.shape)
+        link.exchange(np.zeros(7), packet, 1.0, np.zeros(6))
+        link.pose()
+    finally:
+        link.close()
+
+
 JOBS = (
     Job("gap", _compile_gap, 140.0),
     Job("environments", _compile_environments, 95.0),
     Job("teleoperation", _compile_teleoperation, 65.0),
+    Job("analyses", _compile_analyses, 30.0),
     Job("runs", _compile_runs, 15.0),
+    Job("haptics", _compile_haptics, 10.0),
     Job("laws", _compile_laws, 5.0),
 )
 

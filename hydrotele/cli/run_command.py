@@ -21,7 +21,6 @@ from hydrotele.cli.console import (
     write_json,
 )
 from hydrotele.cli.export_command import export_machine
-from hydrotele.cli.replay_command import replay_logs
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import save_log
@@ -127,6 +126,8 @@ def run_demo(target: Path) -> None:
     Raises:
         InputError: the folder cannot be written.
     """
+    from hydrotele.cli.replay_command import replay_logs  # it imports scipy.signal, which runs do not need
+
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:

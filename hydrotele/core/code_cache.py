@@ -30,6 +30,7 @@ from numba.core.serialize import dumps
 
 from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine
 from hydrotele.core.linking import external_callees, load_callees
+from hydrotele.core.target_processor import publish_runtime
 
 CODE_VERSIONS = (
     sysconfig.get_config_var("SOABI"),  # Python's binary interface, of which all releases of 3.11 share one
@@ -89,7 +90,7 @@ class CodeCache(NullCache):
         """
         if self._folder is None and self._shipped_folder is None:
             return None
-        target_context.refresh()
+        publish_runtime()
         found = self._load(self._shipped_folder, sig, target_context) or self._load(self._folder, sig, target_context)
         if found is None and self._lock_handle is None and self._folder is not None:
             self._lock_handle = _acquire_lock(self._folder, self._function, self._form)

@@ -12,6 +12,7 @@ compiled by numba as without this package.
 Source of the levels: x86-64 psABI, version 1.0, table 3.1.
 """
 
+import functools
 from typing import Any
 
 from llvmlite import binding
@@ -19,6 +20,7 @@ from numba.core import registry
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import CompileResult
+from numba.core.runtime import _nrt_python  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
 _V2 = ("cx16", "sahf", "popcnt", "sse3", "ssse3", "sse4.1", "sse4.2")
 _LEVELS = {
@@ -134,6 +136,17 @@ class CFunction(CFunc):
 def processor_name() -> str:
     """Return LLVM's name of the processor for which functions are compiled, such as `x86-64-v3`."""
     return TARGET.target_context.codegen().magic_tuple()[1]
+
+
+@functools.cache
+def publish_runtime() -> None:
+    """Make the symbols of numba's runtime for arrays known to LLVM.
+
+    Stored code needs no more than that. `refresh` of numba's target context does it, too, but also
+    loads the tables of the compiler, which takes a fifth of a second; numba calls it before it compiles.
+    """
+    for name, address in _nrt_python.c_helpers.items():
+        binding.add_symbol(name if name.startswith("_") else f"NRT_{name}", address)
 
 
 def publish_symbol(result: CompileResult) -> str:

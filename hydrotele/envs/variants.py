@@ -6,7 +6,7 @@ episode selects a variant by copying model parameters and a state in native code
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,6 @@ from hydrotele.core.files import resolve_path
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.envs.episode import MAX_AXES, MAX_CHANNELS
 from hydrotele.envs.task import Options, Task
-from hydrotele.gap.posterior import Posterior, machine_of_sample, read_posterior
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.scenario.surrounding_objects import SurroundingObject
@@ -86,7 +85,7 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     key = repr((task.name, options.effects, ranges, folder and resolve_path(folder), written, options.variants,
                 options.variant_seed, options.timestep))  # fmt: skip
     if key not in _CACHE:
-        _CACHE[key] = _build_variants(task, options, nominal, ranges, _read_posterior(folder, nominal))
+        _CACHE[key] = _build_variants(task, options, nominal, ranges, _choose_machine(options, folder, nominal))
         while len(_CACHE) > _MAX_CACHED_SETS:
             _CACHE.pop(next(iter(_CACHE)))
     return _CACHE[key]
@@ -106,29 +105,34 @@ def split_randomise(options: Options) -> tuple[tuple[Mapping[str, Any], ...], Pa
     return tuple(entry for entry in entries if not isinstance(entry, str | Path)), folders[0] if folders else None
 
 
-def _read_posterior(folder: Path | None, nominal: Machine) -> Posterior | None:
-    """Read the posterior of a result folder and check that it is of the task's machine and tool."""
+def _choose_machine(options: Options, folder: Path | None, nominal: Machine) -> Callable[[int], Machine]:
+    """Return a function that returns the machine of variant k: the nominal one, or a sample of a posterior.
+
+    Raises InputError if the posterior in the folder is not of the task's machine and tool.
+    """
     if folder is None:
-        return None
+        return lambda number: nominal
+    from hydrotele.gap.posterior import machine_of_sample, read_posterior  # slow: it imports scipy.signal
+
     posterior = read_posterior(folder)
     own = posterior.machine
     if (own.name, own.tool, set(own.axes)) != (nominal.name, nominal.tool, set(nominal.axes)):
         message = f"is the result for {own.name} with the tool {own.tool}; the task needs {nominal.name} with"
         raise InputError(f"randomise {folder}", f"{message} {nominal.tool} and the same axes")
-    return posterior
+    order = np.random.default_rng(options.variant_seed).permutation(len(posterior.samples))
+    return lambda number: machine_of_sample(posterior, order[number % len(order)])
 
 
 def _build_variants(
-    task: Task, options: Options, nominal: Machine, ranges: Sequence[Mapping[str, Any]], posterior: Posterior | None
-) -> Variants:
+    task: Task, options: Options, nominal: Machine, ranges: Sequence[Mapping[str, Any]],
+    choose_machine: Callable[[int], Machine],
+) -> Variants:  # fmt: skip
     machines, plants, states, tips = [], [], [], []
-    order = np.random.default_rng(options.variant_seed).permutation(len(posterior.samples)) if posterior else []
     for number in range(options.variants):
         rng = np.random.default_rng([options.variant_seed, number])
         joints = task.start(nominal, rng)
         things = task.surroundings(nominal, rng, joints)
-        machine = machine_of_sample(posterior, order[number % len(order)]) if posterior else nominal
-        machine = _apply_effects(machine, options.effects, ranges, rng)
+        machine = _apply_effects(choose_machine(number), options.effects, ranges, rng)
         known = (p for m, p in zip(machines, plants, strict=True)
                  if m == machine and p.surroundings == things)  # fmt: skip
         plant = next(known, None)

@@ -6,7 +6,6 @@ Positions of all joints from some of them, all assemblies, and Jacobians.
 from collections.abc import Sequence
 
 import numpy as np
-import scipy.optimize
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
@@ -91,6 +90,8 @@ def describe_unclosed_loop(chain: Chain, given: Sequence[str], position: np.ndar
         The message: the row, the closure with the largest opening at the best approximation, the
         opening in mm, and what to do.
     """
+    from scipy.optimize import least_squares  # imported here, because it is slow and only errors need it
+
     columns = np.array([chain.index(name) for name in given], np.int64)
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
     q, rng = np.array(chain.start, float), np.random.default_rng(0)
@@ -101,7 +102,7 @@ def describe_unclosed_loop(chain: Chain, given: Sequence[str], position: np.ndar
         return evaluate_loop_residuals(chain.tree, q)[0][:, 0]
 
     starts = [chain.start[others] + k * rng.uniform(-1.0, 1.0, len(others)) for k in range(_OPENING_SEARCHES)]
-    q[others] = min((scipy.optimize.least_squares(residual, x) for x in starts), key=lambda one: one.cost).x
+    q[others] = min((least_squares(residual, x) for x in starts), key=lambda one: one.cost).x
     closure, opening = _largest_opening(chain, q)
     values = ", ".join(
         f"{name} {value:.4g} {'m' if chain.tree.is_slide[j] else 'rad'}"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import llvmlite.binding
 import numba
+import numpy as np
 import pytest
 
 import hydrotele
@@ -97,3 +98,36 @@ def test_other_packages_keep_their_processor():
 def test_an_older_processor_gets_code_of_an_older_level(missing, level):
     names = "cx16 sahf popcnt sse3 ssse3 sse4.1 sse4.2 avx avx2 bmi bmi2 f16c fma lzcnt movbe xsave".split()
     assert choose_processor({name: name not in missing for name in names}) == level
+
+
+LEVELS = """
+import sys
+from llvmlite import binding
+features = binding.get_host_cpu_features()
+features["avx2"] = features["avx2"] and sys.argv[1] == "x86-64-v3"
+binding.get_host_cpu_features = lambda: features
+import numpy as np
+from hydrotele.core.target_processor import processor_name
+from hydrotele.run.run import run_scenario
+from hydrotele.scenario.scenario import load_scenario
+run = run_scenario(load_scenario("dig", {"duration": "1"}))
+np.save(sys.argv[2], np.array([run.truth[name] for name in run.truth.columns], float))
+print(processor_name())
+"""
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(processor_name() != "x86-64-v3", reason="the processor is older or of another architecture")
+def test_the_older_level_gives_the_same_run(tmp_path):
+    """x86-64-v2 has no fused multiply-add, so that results differ by rounding."""
+    for level in ("x86-64-v3", "x86-64-v2"):
+        done = subprocess.run(
+            [sys.executable, "-c", LEVELS, level, tmp_path / f"{level}.npy"],
+            capture_output=True, text=True, check=True,
+            env=os.environ | {"PYTHONPATH": str(PACKAGE.parent), "XDG_CACHE_HOME": str(tmp_path)},
+        )  # fmt: skip
+        assert done.stdout.split() == [level]
+    new, old = (np.load(tmp_path / f"{level}.npy") for level in ("x86-64-v3", "x86-64-v2"))
+    scale = np.nanmax(np.abs(new), axis=1, keepdims=True)
+    error = np.abs(new - old) / np.where(scale > 0.0, scale, 1.0)
+    print(np.nanmax(error), new.shape)

@@ -1,16 +1,17 @@
-"""Build a wheel that contains the compiled functions, install it in an empty environment and measure first use.
+"""Build wheels that contain the compiled functions, install them in empty environments and measure first use.
 
-    python tools/release/build_wheel.py --out dist                       # for the Python that runs this
-    python tools/release/build_wheel.py --out dist --python python3.12   # for another one
-    python tools/release/build_wheel.py --out dist --sdist               # also install the source distribution
+    python tools/release/build_wheel.py --out dist                                   # for the Python that runs this
+    python tools/release/build_wheel.py --out dist --python python3.11 python3.12    # for others
+    python tools/release/build_wheel.py --out dist --sdist           # also install the source distribution
 
-The wheel is built without compiled code and installed in an environment of its own. There
-`hydrotele compile` fills an empty cache, which becomes the folder `hydrotele/compiled_code` of the wheel.
-The wheel is for one minor version of Python; pip installs the plain wheel elsewhere.
+For each Python the plain wheel is installed in an environment of its own. There `hydrotele compile` fills an
+empty cache, which becomes the folder `hydrotele/compiled_code` of the wheel. The wheel is for one minor version
+of Python; elsewhere pip installs the plain wheel.
 
-Then the wheel is installed in another environment, and each command runs as a new user with an
-empty cache. The script prints a table and ends with 1 if a command fails, compiles a function or takes
-longer than its limit. Needs `uv` and the network.
+Then `pip install` installs the wheel in another environment, and each task runs as a new user with an empty
+cache. pip's output is kept in OUT/install_TAG.log, TAG being the wheel's name of the Python. The script prints a
+table and ends with 1 if a command fails, a function is compiled or a task takes longer than its limit. Needs the
+network.
 """
 
 import argparse
@@ -84,26 +85,35 @@ class Measurement(NamedTuple):
     compiled: int
 
 
-def run(*command: str | Path, **options) -> None:
-    """Run a command; end this script with the command's output if it fails."""
+def run(*command: str | Path, **options) -> str:
+    """Run a command and return its output; end this script with the output if it fails."""
     done = subprocess.run(
         [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
     )  # fmt: skip
     if done.returncode:
         raise SystemExit(f"{' '.join(map(str, command))}\n{done.stdout}")
+    return done.stdout
 
 
-def find_uv() -> str:
-    """Return the path of uv: the user's or that of tools/setup."""
-    found = shutil.which("uv") or shutil.which(ROOT / ".venv" / "bin" / "uv")
-    return found or shutil.which("uv", path=Path(sys.executable).parent) or sys.exit("uv is missing")
+def make_environment(folder: Path, python: str, package: Path, log: Path) -> float:
+    """Make an empty environment and install a wheel or source distribution there with pip.
 
+    Args:
+        folder: folder of the environment.
+        python: interpreter.
+        package: the wheel or source distribution.
+        log: file to which pip's output is added.
 
-def make_environment(folder: Path, python: str, package: Path) -> None:
-    """Make an empty environment and install a wheel or source distribution with its dependencies there."""
-    run(find_uv(), "venv", "--python", python, folder)
-    # pip, unlike uv, compiles Python's bytecode by default.
-    run(find_uv(), "pip", "install", "--compile-bytecode", "--python", folder / "bin" / "python", package)
+    Returns:
+        Elapsed time of `pip install` [s].
+    """
+    run(python, "-m", "venv", folder)
+    start = time.monotonic()
+    told = run(folder / "bin" / "python", "-m", "pip", "install", package, cwd=folder)
+    seconds = time.monotonic() - start
+    with log.open("a") as file:
+        file.write(f"pip install {package.name}\n{told}{seconds:.0f} s\n\n")
+    return seconds
 
 
 def add_compiled_code(plain: Path, compiled: Path, python_tag: str, out: Path) -> Path:
@@ -149,65 +159,106 @@ def measure(commands: list[list[str]], environment: Path, home: Path) -> Measure
     Args:
         commands: arguments of each command after the `bin` folder.
         environment: folder of the environment.
-        home: new folder for the cache and the results.
+        home: folder for the cache and the results.
     """
-    home.mkdir()
+    home.mkdir(exist_ok=True)
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
     variables = kept | {"XDG_CACHE_HOME": str(home / "cache")}
+    cached = len([*home.rglob("*.code")])
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     for program, *arguments in commands:
         run(environment / "bin" / program, *arguments, cwd=home, env=variables)
     after, seconds = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - start
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Measurement(seconds, spent, len([*home.rglob("*.code")]))
+    return Measurement(seconds, spent, len([*home.rglob("*.code")]) - cached)
+
+
+def measure_tasks(environment: Path, homes: Path, label: str, is_compiled: bool) -> tuple[list[str], bool]:
+    """Measure all tasks in an environment.
+
+    Args:
+        environment: folder of the environment.
+        homes: new folder for the users' caches and results.
+        label: text that is added to the names of the tasks.
+        is_compiled: whether the environment has compiled functions. If so, every task has a user of its own and
+            a time limit, and must not compile.
+
+    Returns:
+        (rows of the table, whether a task compiled a function or took too long).
+    """
+    homes.mkdir()
+    rows, failed = [], False
+    for k, task in enumerate(TASKS):
+        home = homes / (str(k) if is_compiled else "one")
+        found = measure(task.commands, environment, home)
+        limit = task.max_seconds if is_compiled else None
+        failed |= is_compiled and (found.compiled > 0 or found.seconds > (limit or found.seconds))
+        rows.append(
+            f"| {task.name}{label} | {found.seconds:.1f} | {limit or ''} | {found.processor_seconds:.1f} |"
+            f" {found.compiled} |"
+        )
+    return rows, failed
+
+
+def build_and_measure(python: str, plain: Path, source: Path | None, out: Path, work: Path) -> tuple[list[str], bool]:
+    """Build the wheel for a Python, install it, and the source distribution if given, and measure the tasks.
+
+    Args:
+        python: interpreter.
+        plain: wheel without compiled code.
+        source: source distribution; None to leave it out.
+        out: folder of the wheel and of pip's output.
+        work: new folder for the environments.
+
+    Returns:
+        (lines of the report, whether a task compiled a function or took too long).
+    """
+    work.mkdir()
+    tag = run(python, "-c", "import sys; print(f'cp{sys.version_info.major}{sys.version_info.minor}')").strip()
+    log = out / f"install_{tag}.log"
+    log.unlink(missing_ok=True)
+    make_environment(work / "build", python, plain, log)
+    filled = measure([["hydrotele", "compile"]], work / "build", work / "filled")
+    wheel = add_compiled_code(plain, work / "filled" / "cache" / "hydrotele" / "compiled", tag, out)
+    install_seconds = make_environment(work / "wheel", python, wheel, log)
+    rows = [
+        f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB, installed in {install_seconds:.0f} s",
+        f"compiling {filled.compiled} functions: {filled.processor_seconds:.0f} s of processor time,"
+        f" {filled.seconds:.0f} s elapsed", "",
+        "| from an empty cache | elapsed [s] | limit [s] | processor [s] | functions compiled |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]  # fmt: skip
+    measured, failed = measure_tasks(work / "wheel", work / "homes", "", True)
+    rows += measured
+    if source is not None:
+        make_environment(work / "sdist", python, source, log)
+        rows += measure_tasks(work / "sdist", work / "sdist_homes", ", source distribution", False)[0]
+    return [*rows, ""], failed
 
 
 def main() -> int:
     """Build and measure; 1 if a task compiles a function or takes too long."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the wheels")
-    parser.add_argument("--python", default=sys.executable, help="interpreter that the wheel is for")
-    parser.add_argument("--compiled", type=Path, help="cache folder that is filled already, for these sources")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the wheels and of pip's output")
+    parser.add_argument("--python", nargs="+", default=[sys.executable], help="interpreters that wheels are for")
     parser.add_argument("--sdist", action="store_true", help="install the source distribution, too")
     args = parser.parse_args()
+    if missing := [python for python in args.python if shutil.which(python) is None]:
+        parser.error(f"not installed: {', '.join(missing)}")
     args.out.mkdir(parents=True, exist_ok=True)
+    failed = False
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         for kind in ("wheel", "sdist"):
             run(sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", work, cwd=ROOT)
         (plain,), (source,) = work.glob("*-py3-none-any.whl"), work.glob("*.tar.gz")
-        rows = [f"plain wheel: {plain.stat().st_size / 1e6:.1f} MB"]
-        if args.compiled is None:
-            make_environment(work / "build", args.python, plain)
-            filled = measure([["hydrotele", "compile"]], work / "build", work / "filled")
-            rows.append(
-                f"compiling {filled.compiled} functions: {filled.processor_seconds:.0f} s of processor time,"
-                f" {filled.seconds:.0f} s elapsed"
+        print(f"plain wheel: {plain.stat().st_size / 1e6:.1f} MB\n")
+        for k, python in enumerate(args.python):
+            rows, is_bad = build_and_measure(
+                python, plain, source if args.sdist else None, args.out.resolve(), work / str(k)
             )
-            args.compiled = work / "filled" / "cache" / "hydrotele" / "compiled"
-        version = "import sys; print(f'cp{sys.version_info.major}{sys.version_info.minor}')"
-        tag = subprocess.run([args.python, "-c", version], capture_output=True, text=True, check=True).stdout.strip()
-        wheel = add_compiled_code(plain, args.compiled, tag, args.out)
-        rows.append(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB")
-        rows += ["", "| from an empty cache | elapsed [s] | limit [s] | processor [s] | functions compiled |",
-                 "| --- | ---: | ---: | ---: | ---: |"]  # fmt: skip
-        make_environment(work / "wheel", args.python, wheel)
-        failed = False
-        for k, task in enumerate(TASKS):
-            found = measure(task.commands, work / "wheel", work / f"home{k}")
-            failed |= found.compiled > 0 or found.seconds > (task.max_seconds or found.seconds)
-            rows.append(
-                f"| {task.name} | {found.seconds:.1f} | {task.max_seconds or ''} | {found.processor_seconds:.1f} |"
-                f" {found.compiled} |"
-            )
-        if args.sdist:
-            make_environment(work / "sdist", args.python, source)
-            found = measure(TASKS[0].commands, work / "sdist", work / "home_sdist")
-            rows.append(
-                f"| {TASKS[0].name}, from the source distribution | {found.seconds:.1f} | |"
-                f" {found.processor_seconds:.1f} | {found.compiled} |"
-            )
-    print("\n".join(rows))
+            print("\n".join(rows), flush=True)
+            failed |= is_bad
     return int(failed)
 
 
