@@ -111,6 +111,10 @@ class GapModel(Protocol):
         """Whiten the errors of later guesses with the gains of this one; return it."""
         ...
 
+    def compact(self, judged: Judged) -> Judged:
+        """Return a model without what `set_base` can compute again, so that it needs little memory."""
+        return judged
+
     def fit(self, guess: Guess, steps: int) -> Fit:
         """Fit the parameters of some effects with the gains of the base."""
         ...

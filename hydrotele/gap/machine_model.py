@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
 from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
 from hydrotele.gap.gap_model import GapModel
-from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs
+from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs, states_after_rows
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
 from hydrotele.machine.machine import Machine
@@ -59,6 +59,10 @@ class MachineModel(GapModel):
     def set_base(self, judged: Judged) -> Judged:
         """Set the base of later errors."""
         return self.evidence.set_base(judged)
+
+    def compact(self, judged: Judged) -> Judged:
+        """Leave out gains and Jacobians."""
+        return judged.compact()
 
     def fit(self, guess: Guess, steps: int) -> Fit:
         """Fit with the gains of the base."""
@@ -170,9 +174,9 @@ class MachineModel(GapModel):
             colours = (Colour(c, float(size), rows * period) for c, size in enumerate(shares * total))
             return with_noise(shares * total, tuple(colours))
 
-        common = {rows: first_order(rows) for rows in _CORRELATION_ROWS}
+        common = {rows: first_order(rows).compact() for rows in _CORRELATION_ROWS}
         best_rows = min(common, key=lambda rows: charged_score(common[rows]))
-        common |= {rows: first_order(rows) for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
+        common |= {rows: first_order(rows).compact() for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
         found = [judged, *common.values()]
         if levels.colours:
             white = with_noise(total, ())
@@ -192,13 +196,23 @@ def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class FilterLinearisation:
-    """Columns of the linearised filter, see `gap.gap_model.Linearisation`."""
+    """Columns of the linearised filter, see `gap.gap_model.Linearisation`.
+
+    Attributes:
+        evidence: the runs.
+        machine: the model.
+        tracks: of the first seconds of each run.
+        table: the columns.
+        fraction: of the rows that the columns hold.
+        units: balance and axis -> what a unit changes in the states of each track.
+    """
 
     evidence: Evidence
     machine: Machine
     tracks: Sequence[Track]
     table: Dictionary
     fraction: float
+    units: dict[tuple[str, str], list[np.ndarray]] = field(default_factory=dict)
 
     @property
     def versions(self) -> Sequence[Version]:
@@ -221,8 +235,13 @@ class FilterLinearisation:
         return self.table.parameters
 
     @cached_property
+    def unchanged_runs(self) -> list[np.ndarray]:
+        """States of the model a row after those of each track, for the changes that laws make."""
+        return self.evidence.map(lambda track: states_after_rows(self.machine, track), self.tracks)
+
+    @cached_property
     def seen_runs(self) -> list[Seen]:
-        """What the smoother says of each run."""
+        """Variables of each run."""
         return [see_run(self.machine, self.evidence.data, track) for track in self.tracks]
 
     def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
@@ -235,7 +254,15 @@ class FilterLinearisation:
 
     def with_laws(self, laws: Sequence[LawForm]) -> "FilterLinearisation":
         """Return the same with the columns of laws."""
-        table = self.table.with_laws(laws, self.machine, self.tracks, self.seen_runs, self.evidence.map)
+        new = {(law.balance, law.axis): law for law in laws if (law.balance, law.axis) not in self.units}
+        tracks, unchanged_runs, each = self.tracks, self.unchanged_runs, self.evidence.map
+
+        def change(law: LawForm) -> list[np.ndarray]:
+            pairs = zip(tracks, unchanged_runs, strict=True)
+            return [law.unit_changes(self.machine, track, unchanged) for track, unchanged in pairs]
+
+        self.units.update(zip(new, each(change, list(new.values())), strict=True))
+        table = self.table.with_laws(laws, self.units, tracks, self.seen_runs, each)
         return dataclasses.replace(self, table=table)
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:

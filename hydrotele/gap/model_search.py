@@ -11,7 +11,7 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,11 +99,16 @@ class Model:
 
 @dataclass(frozen=True)
 class Round:
-    """A round of the search: the model before and after, and the other refined models."""
+    """A round of the search: the model before and after, and the other refined models, all compact."""
 
     before: Model
     after: Model
     others: tuple[Model, ...]
+
+
+def compact(model: GapModel, one: Model) -> Model:
+    """Return a model that needs little memory; `GapModel.set_base` computes again what it lacks."""
+    return replace(one, judged=model.compact(one.judged))
 
 
 def keys_of(model: Model) -> set[tuple[str, str]]:
@@ -163,15 +168,14 @@ def search_model(
     given = Model(settle_noise(model, model.judge(Guess())))
     model.keep(given.judged)
     candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
-    rounds, first = add_effects(model, given, candidates, has_laws, tell)
-    now = rounds[-1].after if rounds else given
+    now, rounds, first = add_effects(model, given, candidates, has_laws, tell)
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
     tell("remove unnecessary effects", 0.87)
     now, rests = remove_needless(model, given, now, rounds)
     tell("compare alternative effects", 0.9)
     now, rests, rivals = exchange(model, now, rests, rounds)
-    model.set_base(now.judged)
+    now = replace(now, judged=model.set_base(now.judged))
     charges = tuple(
         occam_penalty(moved_last(now.fit.information, now.guess, k), h.size) if now.fit else 0.0
         for k, h in enumerate(now.guess.hypotheses)
@@ -188,7 +192,7 @@ def search_model(
 
 def add_effects(
     model: GapModel, now: Model, candidates: Sequence[Hypothesis], has_laws: bool, tell: Progress
-) -> tuple[list[Round], tuple[Proposal, ...]]:
+) -> tuple[Model, list[Round], tuple[Proposal, ...]]:
     """Add effects, laws, the calibration, coloured noise and differences between runs as long as each brings enough.
 
     Args:
@@ -199,7 +203,7 @@ def add_effects(
         tell: called with (what is done, fraction done).
 
     Returns:
-        The rounds, and the proposals of the first one.
+        The model, the rounds, and the proposals of the first one.
     """
     quantities, effects = model.list_quantities(candidates), list(dict.fromkeys(c.name for c in candidates))
     first = tuple[Proposal, ...]()
@@ -221,10 +225,11 @@ def add_effects(
         if not better.charged_score < now.charged_score:
             break
         settled = settle(model, better)
-        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        before, after = (compact(model, m) for m in (now, settled))
+        rounds.append(Round(before, after, tuple(m for m in models if m is not better)))
         now = settled
         model.keep(now.judged)
-    return rounds, first
+    return now, rounds, first
 
 
 def settle_noise(model: GapModel, judged: Judged) -> Judged:
@@ -439,13 +444,13 @@ def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
         group = model.uncertain_parameters(guess, proposal.parameter_scale)
         guess = guess.plus(group, np.zeros(group.size)) if group.size else guess
     found = model.refine(now.judged, Guess((*guess.parts, *proposal.parts)), proposal.residual_scale, dense)
-    return Model(found[0], found[1], found[1].whole_penalty) if found else None
+    return compact(model, Model(found[0], found[1], found[1].whole_penalty)) if found else None
 
 
 def colour_noise(model: GapModel, now: Model) -> list[Model]:
     """Return a model with coloured noise of the channels whose readings show it, or nothing; no other part is new."""
     judged = model.propose_noise(now.judged, MIN_LOG_BAYES_FACTOR)
-    return [Model(judged, now.fit, now.penalty)] if judged else []
+    return [compact(model, Model(judged, now.fit, now.penalty))] if judged else []
 
 
 def compare_colours(model: GapModel, now: Model) -> Model:
@@ -466,7 +471,7 @@ def without_part(model: GapModel, given: Model, now: Model, index: int, rounds: 
         if keys_of(known.before) == {h.key for h in guess.hypotheses} and known.before.colours == now.colours:
             return known.before
     model.set_base(now.judged)
-    rest = settle(model, Model(model.judge(guess, reopened=True)))
+    rest = compact(model, settle(model, Model(model.judge(guess, reopened=True))))
     model.set_base(now.judged)
     return rest
 
@@ -509,7 +514,9 @@ def exchange(
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
         models = [
-            settle(model, m) if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken) else m
+            compact(model, settle(model, m))
+            if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken)
+            else m
             for m in models
         ]
         models.sort(key=lambda m: m.score)
@@ -548,7 +555,7 @@ def add_rival(model: GapModel, rest: Model, origin: Round, other: Model) -> Mode
             guess = guess.plus(hypothesis, deviation)
     model.set_base(rest.judged)
     fit = model.fit(guess, 2)
-    return Model(model.judge(fit.guess), fit, fit.whole_penalty)
+    return compact(model, Model(model.judge(fit.guess), fit, fit.whole_penalty))
 
 
 def _rival(model: Model, rest: Model) -> Rival:
