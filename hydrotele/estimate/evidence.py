@@ -93,7 +93,7 @@ class Judged:
     loss: float
 
     def compact(self) -> "Judged":
-        """Return the same without gains and Jacobians, which take most of its memory; `set_base` computes them again."""
+        """Return the same without gains and Jacobians, most of its memory; `set_base` computes them again."""
         return dataclasses.replace(self, tracks=tuple(track.compact() for track in self.tracks))
 
     def blocks(self, seconds: float = BLOCK) -> np.ndarray:

@@ -146,7 +146,7 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
 
 
 def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = False) -> Seen:
-    """A run of a machine by the states of its filter, which its laws see, or by those and the inputs of its smoother."""
+    """A run of a machine by the states of its filter, which its laws see, or by states and inputs of its smoother."""
     size, states, inputs = track.states.shape[1], track.states, dict[Input, np.ndarray]()
     if is_smoothed:
         run, told = smoothed(track)

@@ -119,8 +119,13 @@ class GapModel(Protocol):
         """Fit the parameters of some effects with the gains of the base."""
         ...
 
-    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
-        """Alternate fits and estimates of the noise levels until neither changes; the result is the base."""
+    def settle(self, judged: Judged, wanted: float = np.inf) -> tuple[Judged, Fit]:
+        """Alternate fits and estimates of the noise levels until neither changes; the result is the base.
+
+        Args:
+            judged: the model.
+            wanted: a loss; a model that does not approach it is not fitted to the end.
+        """
         ...
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:

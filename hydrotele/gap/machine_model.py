@@ -26,6 +26,7 @@ from hydrotele.machine.machine import Machine
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
 _REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distance
 _SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
+_LEAST_GAIN = 0.01  # twice the log likelihood: parameters within a tenth of their standard deviations
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 
 
@@ -68,9 +69,10 @@ class MachineModel(GapModel):
         """Fit with the gains of the base."""
         return self.evidence.fit(guess, 0.0, steps=steps, step=MIDDLE)
 
-    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
+    def settle(self, judged: Judged, wanted: float = np.inf) -> tuple[Judged, Fit]:
         """Alternate fits and estimates of the noise levels."""
-        return rescale_between_runs(*fit_until_settled(self.evidence, judged), self.evidence.runs)
+        found = fit_until_settled(self.evidence, judged, wanted, _LEAST_GAIN)
+        return rescale_between_runs(*found, self.evidence.runs)
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension on the nonlinear filter and re-estimate its noise levels."""

@@ -54,7 +54,7 @@ _LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
-_CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
+_CLOSE = 100.0  # twice the log Bayes factor; a rival that stays farther behind is not fitted to the end
 _KEPT = 50  # effects that are linearised again after the first round
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
 _MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
@@ -243,17 +243,22 @@ def settle_noise(model: GapModel, judged: Judged) -> Judged:
     return model.set_base(judged)
 
 
-def settle(model: GapModel, one: Model) -> Model:
+def settle(model: GapModel, one: Model, wanted: float = np.inf) -> Model:
     """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base.
 
     The prior of a law was selected while residual inputs hid a part of it. It is selected again as long as that brings
     evidence.
+
+    Args:
+        model: the data.
+        one: the model.
+        wanted: a score; a model that does not approach it is not fitted to the end.
     """
     if not one.guess.parts:
         return Model(settle_noise(model, one.judged))
-    found = _settle_fit(model, one.judged)
-    while any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
-        again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True))
+    found = _settle_fit(model, one.judged, wanted - one.penalty)
+    while found.score < wanted and any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
+        again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True), np.inf)
         if again.score > found.score - _SETTLED:
             model.set_base(found.judged)
             break
@@ -261,8 +266,8 @@ def settle(model: GapModel, one: Model) -> Model:
     return found
 
 
-def _settle_fit(model: GapModel, judged: Judged) -> Model:
-    judged, fit = model.settle(judged)
+def _settle_fit(model: GapModel, judged: Judged, wanted: float) -> Model:
+    judged, fit = model.settle(judged, wanted)
     return Model(settle_noise(model, judged), fit, fit.whole_penalty)
 
 
@@ -514,7 +519,7 @@ def exchange(
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
         models = [
-            compact(model, settle(model, m))
+            compact(model, settle(model, m, now.score + _CLOSE))
             if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken)
             else m
             for m in models
