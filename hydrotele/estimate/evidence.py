@@ -188,12 +188,10 @@ class Evidence:
 
         def cross(near: Track) -> Track:
             there = own.get(near.run.name, machine)
-            columns = columns_of(there, near, levels.inputs) if levels.inputs else None
-            return track_run(there, self.data, near.run, None, self.step, levels, columns, True, near.rest)
+            return track_run(there, self.data, near.run, None, self.step, levels, None, True, near.rest)
 
-        # about a track without residual inputs the Jacobians may be wrong
-        tracks, same = self.map(cross, self.tracks), bool(levels.inputs)
-        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, same, True, own)
+        tracks = self.map(cross, self.tracks)
+        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True, own=own)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)
 

@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.estimate.colour import Spectrum, find_colour, join_transitions, measure_spectrum, state_labels
+from hydrotele.estimate.colour import Spectrum, find_colour, measure_spectrum, state_labels
 from hydrotele.estimate.filter import (
     Input,
     decay,
@@ -657,8 +657,7 @@ def _crossed(
         there = (own or {}).get(run.name, machine)
         rest = near[index].rest if near else None
         if same:
-            columns = _columns_near(there, near[index], levels.inputs)
-            flow = transitions_near(near[index], levels, columns)
+            columns, flow = _without_pruned(near[index], levels.inputs)
         elif near and levels.inputs:
             columns = columns_of(there, near[index], levels.inputs)
         return track_run(there, data, run, None, step, levels, columns, True, rest, flow)
@@ -666,45 +665,18 @@ def _crossed(
     return tuple(each(cross, range(len(data.fit))))
 
 
-def _columns_near(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.ndarray:
-    """(n, m, nz) what inputs do, from a track of nearly the same machine that may have other inputs."""
-    before = list(near.levels.inputs)
-    if before == list(inputs):
-        return near.columns
-    if set(inputs) <= set(before):
-        return np.ascontiguousarray(near.columns[:, [before.index(i) for i in inputs]])
-    return columns_of(machine, near, inputs)
-
-
-def transitions_near(near: Track, levels: Levels, columns: np.ndarray) -> np.ndarray:
-    """Return the transition Jacobians of a track with other coloured noise and other residual inputs.
-
-    The states of the coloured noise and of the inputs are linear; those of the machine keep their Jacobians.
-
-    Args:
-        near: linearised.
-        levels: with the coloured noise and the m inputs.
-        columns: (n, m, nz) what the inputs do.
-
-    Returns:
-        (n, nz, nz) as `Track.flow`.
-    """
-    period, before = near.run.period, near.levels
-    turn = join_transitions(levels.colours, period)[1]
-    old_turn = join_transitions(before.colours, period)[1]
-    if before.inputs == levels.inputs and [c.channel for c in before.colours] == [c.channel for c in levels.colours]:
-        if np.array_equal(turn, old_turn):
-            return near.flow
-    rows, size = columns.shape[0], columns.shape[2]
-    own = len(near.names) - len(before.inputs) - len(old_turn)
-    first = own + len(turn)
-    flow = np.zeros((rows, first + len(levels.inputs), first + len(levels.inputs)))
-    flow[:, :own, :own] = near.flow[:, :own, :own]
-    flow[:-1, own:first, own:first] = turn.T  # the last row stays 0
-    flow[:-1, first:, :size] = columns[:-1]
-    at = np.arange(first, first + len(levels.inputs))
-    flow[:-1, at, at] = decay(period)
-    return flow
+def _without_pruned(track: Track, inputs: Sequence[Input]) -> tuple[np.ndarray, np.ndarray]:
+    """What inputs do, and transition Jacobians, of a track that may know more inputs."""
+    before = list(track.levels.inputs)
+    if len(before) == len(inputs):
+        return track.columns, track.flow
+    kept = [before.index(i) for i in inputs]
+    first = track.flow.shape[1] - len(before)
+    there = np.concatenate([np.arange(first), first + np.array(kept, dtype=int)])
+    return (
+        np.ascontiguousarray(track.columns[:, kept]),
+        np.ascontiguousarray(track.flow[:, there[:, None], there]),
+    )
 
 
 def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.ndarray:

@@ -25,7 +25,8 @@ from hydrotele.machine.machine import Machine
 
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
 _REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distance
-_SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
+LINEAR_STEP_SECONDS = 12.0
+"""Seconds of each run that the linear step uses; the refinement uses all."""
 _LEAST_GAIN = 0.01  # twice the log likelihood: parameters within a tenth of their standard deviations
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 
@@ -298,7 +299,7 @@ class FilterLinearisation:
 
 def _first_seconds(track: Track) -> Track:
     """Return the first seconds of a linearised track, with its transition Jacobians."""
-    rows = round(_SECONDS / track.run.period)
+    rows = round(LINEAR_STEP_SECONDS / track.run.period)
     first = dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
     there = np.isfinite(first.whitened)
     loss = float(np.sum(first.whitened[there] ** 2 + 2.0 * np.log(first.gains.spread[there])))

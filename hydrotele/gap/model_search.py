@@ -225,8 +225,8 @@ def add_effects(
         if not better.charged_score < now.charged_score:
             break
         settled = settle(model, better)
-        before, after = (compact(model, m) for m in (now, settled))
-        rounds.append(Round(before, after, tuple(m for m in models if m is not better)))
+        rivals = tuple(compact(model, m) for m in models if m is not better)
+        rounds.append(Round(compact(model, now), compact(model, settled), rivals))
         now = settled
         model.keep(now.judged)
     return now, rounds, first
@@ -425,12 +425,17 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 
 
 def extensions(model: GapModel, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
-    """Refine the best proposals that the linear step holds for better than the model."""
+    """Refine the best proposals that the linear step holds for better than the model; all but the best are compact."""
     better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
     chosen = [p for p in better if not p.law][:_TRIED]
     laws = {p.law.kind: p for p in reversed(better) if p.law}
     chosen += laws.values()
-    return [m for m in (refine(model, now, p) for p in chosen) if m is not None]
+    found: list[Model] = []
+    for proposal in chosen:
+        if (refined := refine(model, now, proposal)) is not None:
+            best = min((*found, refined), key=lambda m: m.charged_score)
+            found = [m if m is best else compact(model, m) for m in (*found, refined)]
+    return found
 
 
 def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
@@ -449,13 +454,13 @@ def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
         group = model.uncertain_parameters(guess, proposal.parameter_scale)
         guess = guess.plus(group, np.zeros(group.size)) if group.size else guess
     found = model.refine(now.judged, Guess((*guess.parts, *proposal.parts)), proposal.residual_scale, dense)
-    return compact(model, Model(found[0], found[1], found[1].whole_penalty)) if found else None
+    return Model(found[0], found[1], found[1].whole_penalty) if found else None
 
 
 def colour_noise(model: GapModel, now: Model) -> list[Model]:
     """Return a model with coloured noise of the channels whose readings show it, or nothing; no other part is new."""
     judged = model.propose_noise(now.judged, MIN_LOG_BAYES_FACTOR)
-    return [compact(model, Model(judged, now.fit, now.penalty))] if judged else []
+    return [Model(judged, now.fit, now.penalty)] if judged else []
 
 
 def compare_colours(model: GapModel, now: Model) -> Model:
