@@ -177,9 +177,20 @@ def _hide_origin(builder, space):
 
 @unbox(Reference)
 def _unbox_reference(kind, value, c):
-    """Emit code that converts a Python named tuple to native values in memory and returns their address."""
+    """Emit code that converts a Python named tuple to native values in memory and returns their address.
+
+    The native values hold references to the arrays of the tuple, which numba releases only for types that it knows to
+    contain arrays. So the clean-up after the call releases them.
+    """
     native = c.unbox(kind.record, value)
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)
     _store_fields(c.context, c.builder, kind.record, native.value, space)
-    return NativeValue(_hide_origin(c.builder, space), native.is_error, native.cleanup)
+
+    def release() -> None:
+        if native.cleanup is not None:
+            native.cleanup()
+        if c.context.enable_nrt:
+            c.context.nrt.decref(c.builder, kind.record, native.value)
+
+    return NativeValue(_hide_origin(c.builder, space), native.is_error, release)
