@@ -26,10 +26,11 @@ from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.machine_model import LINEAR_STEP_SECONDS
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 
 LENGTHS = (10.0, 20.0, 40.0)  # s
-_WARM_UP = 5.0  # s of each run
+_WARM_UP = 20.0  # s of all fitted runs
 
 
 class Timing(NamedTuple):
@@ -74,7 +75,7 @@ def shortened(data: Dataset, seconds: float) -> Dataset:
 def time_regression(folder: Path, jobs: int) -> Timing:
     """Search a case with `--method regression` and measure time and memory of this process."""
     data = load_dataset([folder], load_machine("cat215"))
-    find_gap(shortened(data, _WARM_UP), effects=["internal_leakage"], jobs=jobs, method="regression")
+    find_gap(select_exciting_segments(data, _WARM_UP), effects=["internal_leakage"], jobs=jobs, method="regression")
     reports: list[tuple[str, float, float]] = []
 
     def report(text: str, share: float) -> None:
