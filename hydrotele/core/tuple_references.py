@@ -177,16 +177,20 @@ def _hide_origin(builder, space):
 
 @unbox(Reference)
 def _unbox_reference(kind, value, c):
-    """Emit code that converts a Python named tuple to native values in memory and returns their address."""
+    """Emit code that converts a Python named tuple to native values in memory and returns their address.
+
+    The native values hold references to the arrays of the tuple, which numba releases only for types that it knows to
+    contain arrays. So the clean-up after the call releases them.
+    """
     native = c.unbox(kind.record, value)
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)
     _store_fields(c.context, c.builder, kind.record, native.value, space)
 
     def release() -> None:
-        """Emit code that releases the arrays after the call: a reference, an opaque pointer, does not do it."""
         if native.cleanup is not None:
             native.cleanup()
-        c.context.nrt.decref(c.builder, kind.record, native.value)
+        if c.context.enable_nrt:
+            c.context.nrt.decref(c.builder, kind.record, native.value)
 
     return NativeValue(_hide_origin(c.builder, space), native.is_error, release)

@@ -20,7 +20,7 @@ from scipy.special import ndtr, ndtri
 
 from hydrotele.estimate.filter import MEMORY
 from hydrotele.estimate.hypothesis import DomainError, Guess, Hypothesis
-from hydrotele.estimate.levels import find_levels, with_jitter
+from hydrotele.estimate.levels import columns_of, find_levels, with_jitter
 from hydrotele.estimate.track import (
     COARSE,
     STEP,
@@ -92,6 +92,10 @@ class Judged:
     tracks: tuple[Track, ...]
     loss: float
 
+    def compact(self) -> "Judged":
+        """Return the same without gains and Jacobians, most of its memory; `set_base` computes them again."""
+        return dataclasses.replace(self, tracks=tuple(track.compact() for track in self.tracks))
+
     def blocks(self, seconds: float = BLOCK) -> np.ndarray:
         """(B,) -2 log likelihood of stretches of the runs, without constant."""
         return np.concatenate([_blocks(track, seconds) for track in self.tracks])
@@ -120,7 +124,7 @@ class Evidence:
         With `lacking`, or where a channel's accuracy is not stated, noise levels are found from
         the data for every base (`estimate.levels`); otherwise they are those that are stated.
         """
-        self.step, self.lacking = step, lacking or not known_levels(data)
+        self.step, self.lacking, self.jobs = step, lacking or not known_levels(data), jobs
         self.data, self.runs = dataclasses.replace(data, fit=tuple(runs)), tuple(runs)
         self.keep: Callable[[Judged], None] = lambda judged: None
         self._pool = ThreadPoolExecutor(_threads(jobs, len(self.runs)))
@@ -128,6 +132,7 @@ class Evidence:
         self._base, self._steps = Guess(), dict[tuple[str, float], np.ndarray]()
         self._slopes, self._smooth = dict[float, np.ndarray](), dict[float, bool]()
         self._information = list[str](), np.zeros((0, 0))
+        self._restored: tuple[Judged, Judged] | None = None
         self._responses = dict[int, tuple[Hypothesis, np.ndarray | None]]()
 
     def close(self) -> None:
@@ -203,10 +208,29 @@ class Evidence:
 
     def set_base(self, guess: Guess | Judged) -> Judged:
         """Compute gains anew for a guess; later errors are whitened with them."""
-        judged = guess if isinstance(guess, Judged) else self.judged(guess)
+        judged = self._linearised(guess) if isinstance(guess, Judged) else self.judged(guess)
         self.tracks, self._base = judged.tracks, judged.guess
         self._steps, self._slopes, self._smooth, self._responses = {}, {}, {}, {}
         return judged
+
+    def _linearised(self, judged: Judged) -> Judged:
+        """Return a model with the gains and Jacobians that `Judged.compact` left out."""
+        if not any(track.is_compact for track in judged.tracks):
+            return judged
+        if self._restored and self._restored[0] is judged:
+            return self._restored[1]
+        machine, own = judged.guess.machines(self.data.machine)
+
+        def cross(pair: tuple[Track, Track]) -> Track:
+            track, near = pair
+            there, levels = own.get(track.run.name, machine), track.levels
+            columns = columns_of(there, near, levels.inputs) if levels.inputs else None
+            return track_run(there, self.data, track.run, None, self.step, levels, columns, True, track.rest)
+
+        tracks = tuple(self.map(cross, list(zip(judged.tracks, self.tracks, strict=True))))
+        loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
+        self._restored = judged, Judged(judged.guess, tracks, loss + judged.guess.prior)
+        return self._restored[1]
 
     @property
     def base_errors(self) -> np.ndarray:
@@ -285,7 +309,7 @@ class Evidence:
         both are.
         """
         nudges, machine, runs = guess.nudges(), self.data.machine, guess.parameter_runs
-        linear = self._linear_slopes(guess)
+        linear = self._linear_slopes(guess, parallel)
 
         def column(index: int) -> np.ndarray:
             if index in linear:
@@ -309,18 +333,21 @@ class Evidence:
         found = self.map(column, columns) if parallel else [column(i) for i in columns]
         return np.column_stack(found) if found else np.zeros((len(errors), 0))
 
-    def responses(self, hypothesis: Hypothesis, tracks: Sequence[Track]) -> np.ndarray | None:
+    def responses(
+        self, hypothesis: Hypothesis, tracks: Sequence[Track], parallel: bool = True
+    ) -> np.ndarray | None:  # fmt: skip
         """Return the change (E, p) of the base's errors per deviation of what is linear, see `Hypothesis.responses`."""
         machine = self._base.machine(self.data.machine)
-        parts = [hypothesis.responses(machine, self.data, track) for track in tracks]
+        each = self.map if parallel else map
+        parts = list(each(lambda track: hypothesis.responses(machine, self.data, track), tracks))
         return None if any(part is None for part in parts) else np.concatenate([p for p in parts if p is not None])
 
-    def _linear_slopes(self, guess: Guess) -> dict[int, np.ndarray]:
+    def _linear_slopes(self, guess: Guess, parallel: bool) -> dict[int, np.ndarray]:
         """Return index -> slope (E,) of the deviations of a guess that need no simulation."""
         found, first = {}, 0
         for hypothesis in guess.hypotheses:
             if id(hypothesis) not in self._responses:
-                self._responses[id(hypothesis)] = hypothesis, self.responses(hypothesis, self.tracks)
+                self._responses[id(hypothesis)] = hypothesis, self.responses(hypothesis, self.tracks, parallel)
             columns = self._responses[id(hypothesis)][1]
             if columns is not None:
                 found |= {first + k: column for k, column in enumerate(columns.T)}
@@ -362,7 +389,7 @@ class Evidence:
         if step not in self._slopes:
             errors = self.errors(self._base, step, parallel=parallel)
             names = self._base.names
-            linear = self._linear_slopes(self._base)
+            linear = self._linear_slopes(self._base, parallel)
             if len(names) - len(linear) <= _MANY:
                 self._slopes[step] = self.slopes(self._base, errors, parallel, step)
                 return self._slopes[step]

@@ -734,10 +734,10 @@ _ROUNDING = 1.0e-13  # of a prediction's variance: less noise is lost in the rou
 
 @compile_without_allocation
 def update_covariance(covariance, slope, noise, pull, gain):
-    """Update a covariance with one reading: `P - K H P`, symmetric and positive definite in spite of rounding.
+    """Update a covariance with one reading: `P - K H P`, positive definite in spite of rounding.
 
     Args:
-        covariance: (n, n) P before the reading; overwritten.
+        covariance: (n, n) P before the reading; overwritten. Only its lower triangle is read and written.
         slope: (n,) H, slope of the reading in the state.
         noise: R, variance of the reading, scalar; counts as at least 1e-13 of H P H'. What it then leaves of
             the variance, R H P H' / (R + H P H'), exceeds the rounding of the difference.
@@ -754,18 +754,66 @@ def update_covariance(covariance, slope, noise, pull, gain):
         pull[s] = 0.0
     for k in range(size):  # a reading depends on few states
         if slope[k] != 0.0:
-            for s in range(size):
+            for s in range(k + 1):
                 pull[s] += covariance[k, s] * slope[k]
+            for s in range(k + 1, size):
+                pull[s] += covariance[s, k] * slope[k]
     for s in range(size):
         spread += slope[s] * pull[s]
     total = max(noise, _ROUNDING * spread) + spread
     for s in range(size):
         gain[s] = pull[s] / total
-        for k in range(s):
+        for k in range(s + 1):
             covariance[s, k] -= gain[s] * pull[k]
-            covariance[k, s] = covariance[s, k]
-        covariance[s, s] -= gain[s] * pull[s]
     return total
+
+
+@compile_without_allocation
+def mirror_lower_triangle(matrix):
+    """Copy the lower triangle of a matrix (n, n) to its upper one."""
+    for a in range(len(matrix)):
+        for b in range(a):
+            matrix[b, a] = matrix[a, b]
+
+
+@compile_without_allocation
+def multiply_transposed(left, right, out):
+    """Write the product left' right of two matrices (n, n); zeros of `left` are skipped, four rows at a time.
+
+    Every sum adds its terms in the order of the rows. The innermost index is contiguous.
+    """
+    size = len(out)
+    for a in range(size):
+        for b in range(size):
+            out[a, b] = 0.0
+        for k in range(0, size - 3, 4):
+            p, q, r, s = left[k, a], left[k + 1, a], left[k + 2, a], left[k + 3, a]
+            if p != 0.0 or q != 0.0 or r != 0.0 or s != 0.0:
+                for b in range(size):
+                    total = ((out[a, b] + p * right[k, b]) + q * right[k + 1, b]) + r * right[k + 2, b]
+                    out[a, b] = total + s * right[k + 3, b]
+        for k in range(size - size % 4, size):
+            if left[k, a] != 0.0:
+                for b in range(size):
+                    out[a, b] += left[k, a] * right[k, b]
+
+
+@compile_without_allocation
+def multiply_symmetric(left, right, out):
+    """Write the product left right of two matrices (n, n) that is symmetric but for rounding, see above."""
+    size = len(out)
+    for a in range(size):
+        for b in range(a + 1):
+            out[a, b] = 0.0
+        for k in range(0, size - 3, 4):
+            p, q, r, s = left[a, k], left[a, k + 1], left[a, k + 2], left[a, k + 3]
+            for b in range(a + 1):
+                total = ((out[a, b] + p * right[k, b]) + q * right[k + 1, b]) + r * right[k + 2, b]
+                out[a, b] = total + s * right[k + 3, b]
+        for k in range(size - size % 4, size):
+            for b in range(a + 1):
+                out[a, b] += left[a, k] * right[k, b]
+    mirror_lower_triangle(out)
 
 
 @compile_without_allocation
@@ -847,23 +895,9 @@ def _among(numbers, number):
 
 @compile_without_allocation
 def _carry(columns, covariance, work, drift):
-    """`P = F P F' + Q`, kept symmetric; the rows of `columns` are F's columns."""
-    size = len(drift)
-    for a in range(size):  # work = F P, then P = work F'; the innermost index is contiguous
-        work[a] = 0.0
-    for k in range(size):
-        for a in range(size):
-            part = columns[k, a]
-            if part != 0.0:
-                for b in range(size):
-                    work[a, b] += part * covariance[k, b]
-    for a in range(size):
-        covariance[a] = 0.0
-        for k in range(size):
-            part = work[a, k]
-            for b in range(a + 1):
-                covariance[a, b] += part * columns[k, b]
-    for a in range(size):
-        for b in range(a):
-            covariance[b, a] = covariance[a, b]
+    """`P = F P F' + Q` by the lower triangle of P, kept symmetric; the rows of `columns` are F's columns."""
+    mirror_lower_triangle(covariance)
+    multiply_transposed(columns, covariance, work)  # F P
+    multiply_symmetric(work, columns, covariance)
+    for a in range(len(drift)):
         covariance[a, a] += drift[a]

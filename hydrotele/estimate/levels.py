@@ -32,6 +32,9 @@ from hydrotele.estimate.filter import (
     decay,
     input_columns,
     input_sizes,
+    mirror_lower_triangle,
+    multiply_symmetric,
+    multiply_transposed,
     possible_inputs,
     update_covariance,
 )
@@ -146,24 +149,10 @@ def linear_filter(run, noise, drift, whitened, width, gain, before, covariance):
         for s in range(size):
             for r in range(size):
                 d[r] += f[s, r] * pull[s]
-        for a in range(size):  # work = F p, then p = work F'; the innermost index is contiguous
-            for b in range(size):
-                work[a, b] = 0.0
-            for k in range(size):
-                part = f[k, a]
-                if part == 0.0:
-                    continue
-                for b in range(size):
-                    work[a, b] += part * p[k, b]
+        mirror_lower_triangle(p)
+        multiply_transposed(f, p, work)  # F p
+        multiply_symmetric(work, f, p)
         for a in range(size):
-            p[a] = 0.0
-            for k in range(size):
-                part = work[a, k]
-                for b in range(a + 1):
-                    p[a, b] += part * f[k, b]
-        for a in range(size):
-            for b in range(a):
-                p[b, a] = p[a, b]
             p[a, a] += drift[a] + run.startle[row, a]
     return loss
 
@@ -212,24 +201,8 @@ def linear_smoother(run, rates, whitened, width, gain, slopes, pulls, lacks):
                     new[s] += turned[k, s] * r[k]
             for s in range(size):
                 r[s] = new[s]
-            for a in range(size):  # n = F' n F with f the transpose of F
-                for b in range(size):
-                    work[a, b] = 0.0
-                for k in range(size):
-                    part = f[a, k]
-                    if part == 0.0:
-                        continue
-                    for b in range(size):
-                        work[a, b] += part * n[k, b]
-            for a in range(size):
-                n[a] = 0.0
-                for k in range(size):
-                    part = work[a, k]
-                    for b in range(a + 1):
-                        n[a, b] += part * turned[k, b]
-            for a in range(size):
-                for b in range(a):
-                    n[b, a] = n[a, b]
+            multiply_transposed(turned, n, work)  # n = F' n F with f the transpose of F
+            multiply_symmetric(work, turned, n)
         for c in range(channels - 1, -1, -1):
             if np.isnan(whitened[row, c]):
                 continue
@@ -240,6 +213,11 @@ def linear_smoother(run, rates, whitened, width, gain, slopes, pulls, lacks):
             pull[:] = 0.0
             for k in range(size):
                 u -= k_gain[k] * r[k]
+            for k in range(0, size - 3, 4):
+                for s in range(size):
+                    total = (pull[s] + n[k, s] * k_gain[k]) + n[k + 1, s] * k_gain[k + 1]
+                    pull[s] = (total + n[k + 2, s] * k_gain[k + 2]) + n[k + 3, s] * k_gain[k + 3]
+            for k in range(size - size % 4, size):
                 for s in range(size):
                     pull[s] += n[k, s] * k_gain[k]
             for s in range(size):

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -350,6 +351,16 @@ class Track:
     scales: np.ndarray
 
     @property
+    def is_compact(self) -> bool:
+        """Whether gains and Jacobians were left out."""
+        return len(self.gains.slope) < len(self.whitened)
+
+    def compact(self) -> "Track":
+        """Return the same without gains and Jacobians."""
+        gains = Gains(self.gains.slope[:0].copy(), self.gains.gain[:0].copy(), self.gains.spread)
+        return dataclasses.replace(self, gains=gains, columns=self.columns[:0].copy(), flow=self.flow[:0].copy())
+
+    @property
     def process_variances(self) -> np.ndarray:
         """(nz,) variance that a row adds to the states."""
         return state_drift(list(self.names), self.levels, self.run.period, self.scales)
@@ -396,6 +407,32 @@ _LOOK = 3.0  # s at a run's start that tell where drives rested in their backlas
 def by_kind(names: Sequence[str], table: Mapping[str, float]) -> np.ndarray:
     """(nz,) numbers of a table by state or kind of state; 0 for what it lacks."""
     return np.array([table.get(name, table.get(name.partition(".")[0], 0.0)) for name in names])
+
+
+class _ByIdentity:
+    """An object as the key of a cache, equal to itself only."""
+
+    def __init__(self, value) -> None:
+        self.value = value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByIdentity) and other.value is self.value
+
+
+_MACHINES_AT_ONCE = 16  # that the threads of a search compare, each on all of its runs
+
+
+@lru_cache(maxsize=_MACHINES_AT_ONCE)
+def _prepare(machine: _ByIdentity, data: _ByIdentity) -> tuple[Model, list[str], float]:
+    """Model and names of the states of a machine, and the longest step [s] that it allows; not to be modified."""
+    return (
+        following_model(machine.value, data.value),
+        state_names(machine.value),
+        fine_enough(machine.value, math.inf),
+    )
 
 
 def fine_enough(machine: Machine, step: float) -> float:
@@ -563,12 +600,11 @@ def track_run(
     Returns:
         The track.
     """
-    model = following_model(machine, data)
-    names = state_names(machine)
+    model, names, longest = _prepare(_ByIdentity(machine), _ByIdentity(data))
     if kept is not None:
         levels, columns = kept.levels, _for_states(kept, names)
     levels = levels or Levels(data.noise)
-    trial = _Trial(machine, model, data, levels, step)
+    trial = _Trial(machine, model, data, levels, step, names, longest)
     noise = row_variances(levels, run) if kept is None else np.zeros((0, len(data.channels)))
     if columns is None:
         columns = np.zeros((len(run.command), len(levels.inputs), len(names)))
@@ -625,18 +661,20 @@ class _Trial(NamedTuple):
     data: Dataset
     levels: Levels
     step: float
+    names: list[str]
+    longest: float
 
 
 def _cross(
     trial: _Trial, run: RunData, kept: Track | None, rest: np.ndarray, columns: np.ndarray,
     noise: np.ndarray, linearise: bool = False, given: np.ndarray | None = None,
 ) -> Track:  # fmt: skip
-    machine, model, data, levels, step = trial
-    least = _min_steps_per_row(machine, run.period)
+    machine, model, data, levels, step, own_names, longest = trial
+    least = max(1, math.ceil(run.period / min(run.period, longest) - 1e-6))
     fine, coarse = (max(least, round(run.period / s)) for s in (step, _TANGENT))
     space = model_space(model)
     space.time[1] = run.start
-    names, late = state_names(machine), late_readings(model, run.period)
+    names, late = list(own_names), late_readings(model, run.period)
     rows, c, size, m = len(run.command), len(data.channels), len(names), len(levels.inputs)
     start, spread = start_state(machine, data, run, model, names, np.nan_to_num(rest))
     shown = [data.channels[k] for k in late.channel]

@@ -510,7 +510,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
 
 
 def fit_until_settled(
-    evidence: Evidence, judged: Judged, wanted: float = np.inf
+    evidence: Evidence, judged: Judged, wanted: float = np.inf, least_gain: float = 0.0
 ) -> tuple[Judged, Fit]:  # fmt: skip
     """Fit with levels and gains computed anew until they no longer matter.
 
@@ -518,6 +518,7 @@ def fit_until_settled(
         evidence: the runs; the guess becomes the base.
         judged: the guess to begin with.
         wanted: a loss; what would not come down to it at the present pace is left as it is.
+        least_gain: a guess whose loss the first fit lowers by less is left as it is.
 
     Returns:
         The guess, judged, and its last fit.
@@ -531,6 +532,8 @@ def fit_until_settled(
             kept = evidence.base_slopes(evidence.slope_step)
         last = fit
         fit = evidence.fit(judged.guess, 0.0, kept=kept, step=MIDDLE if group else None)
+        if last is None and _squares(evidence) + judged.guess.prior - fit.loss < least_gain:
+            return evidence.set_base(judged), replace(fit, guess=judged.guess)
         moved = fit.guess.deviation - judged.guess.deviation
         spread = np.sqrt(np.diag(invert_information(fit.information)))
         guess = widened(fit.guess)
@@ -554,6 +557,11 @@ def fit_until_settled(
         found = min((found, again, begin), key=lambda one: one.loss)
         fit = replace(fit, guess=found.guess)
     return evidence.set_base(found), fit
+
+
+def _squares(evidence: Evidence) -> float:
+    """Sum of squares of the errors of a base."""
+    return float(evidence.base_errors @ evidence.base_errors)
 
 
 def polished(evidence: Evidence, judged: Judged) -> tuple[Judged, Fit]:

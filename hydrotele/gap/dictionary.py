@@ -5,7 +5,7 @@ relief valve that opens earlier, friction that holds) has a different version at
 averages over them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.track import COARSE, Track
 from hydrotele.gap.discover import Seen
 from hydrotele.gap.laws import LawForm
-from hydrotele.machine.machine import Machine
 
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one
@@ -131,20 +130,17 @@ class Dictionary:
     law_columns: tuple[np.ndarray, ...] = ()
     parameters: tuple[tuple[str, float], ...] = ()
 
-    def with_laws(self, laws: Sequence[LawForm], machine: Machine, tracks: Sequence[Track], seen: Sequence[Seen],
-                  each: Callable) -> "Dictionary":  # fmt: skip
+    def with_laws(self, laws: Sequence[LawForm], units: Mapping[tuple[str, str], Sequence[np.ndarray]],
+                  tracks: Sequence[Track], seen: Sequence[Seen], each: Callable) -> "Dictionary":  # fmt: skip
         """Return a dictionary of laws instead of versions.
 
         Args:
             laws: L laws.
-            machine: the model.
+            units: balance and axis -> what a unit changes in the states of each track, see `LawForm.unit_changes`.
             tracks: as of `build_dictionary`.
-            seen: what the smoother says of each.
+            seen: their variables.
             each: `map`, or that of a pool.
         """
-        places = {(law.balance, law.axis): law for law in laws}
-        made = each(lambda law: [law.unit_changes(machine, track) for track in tracks], list(places.values()))
-        units = dict(zip(places, made, strict=True))
 
         def of_law(law: LawForm) -> np.ndarray:
             runs = zip(tracks, seen, units[law.balance, law.axis], strict=True)

@@ -146,12 +146,12 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
 
 
 def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = False) -> Seen:
-    """A run of a machine by the states of its filter, which its laws see, or by those of its smoother."""
-    size = track.states.shape[1]
-    run, told = smoothed(track)
-    states = track.states
+    """A run of a machine by the states of its filter, which its laws see, or by states and inputs of its smoother."""
+    size, states, inputs = track.states.shape[1], track.states, dict[Input, np.ndarray]()
     if is_smoothed:
+        run, told = smoothed(track)
         states = states - run.correction[:, :size] + told.deviation[:, :size]
+        inputs = dict(zip(track.levels.inputs, smoothed_inputs(track, (run, told)).T, strict=True))
     model = following_model(machine, data)
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
@@ -185,8 +185,7 @@ def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = F
     known[: min(round(0.5 / track.run.period), len(states) // 4)] = False
     if track.run.valid is not None:
         known &= track.run.valid
-    inputs = zip(track.levels.inputs, smoothed_inputs(track, (run, told)).T, strict=True)
-    return Seen(values, known, dict(inputs))
+    return Seen(values, known, inputs)
 
 
 Case = tuple[Input, str, Table]

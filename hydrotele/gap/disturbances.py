@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.signal import czt
 
 from hydrotele.effects import EFFECTS, Parameter
 from hydrotele.estimate.evidence import Judged, flat
@@ -86,13 +87,14 @@ def _periodic_force(
     period = max(track.run.period for track in tracks)
     longest = max(len(u) * t.run.period for t, u in zip(tracks, forces, strict=True))
     lowest, highest = _MIN_CYCLES / longest, 1.0 / (_MIN_ROWS * period)
-    frequencies = np.arange(lowest, highest, 0.25 / longest)  # a quarter of the width of a peak
+    step = 0.25 / longest  # a quarter of the width of a peak
+    frequencies = np.arange(lowest, highest, step)
     if not len(frequencies):
         return None
     power = np.zeros(len(frequencies))
     for track, u in zip(tracks, forces, strict=True):
-        clock = track.run.start + track.run.period * np.arange(len(u))
-        power += np.abs(np.exp(-2j * math.pi * np.outer(frequencies, clock)) @ (u - np.mean(u))) ** 2
+        turns = 2j * math.pi * track.run.period * np.array([-step, lowest])  # per row, of each factor
+        power += np.abs(czt(u - np.mean(u), len(frequencies), *np.exp(turns))) ** 2
     best = 1.0 / float(frequencies[np.argmax(power * _row_gain(frequencies))])
     (largest,), (unit,) = input_sizes(data.machine, [acts]), input_units(data.machine, [acts])
     amplitude = Parameter(unit, 0.0, -largest, largest, _PERIODIC_STD * largest, 0.1 * _PERIODIC_STD * largest)

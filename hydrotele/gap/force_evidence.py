@@ -392,7 +392,7 @@ class ForceEvidence(GapModel):
         """Fit with the levels of the base."""
         return fit_guess(guess, 0.0, steps, self.errors, self._slopes)
 
-    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
+    def settle(self, judged: Judged, wanted: float = np.inf) -> tuple[Judged, Fit]:
         """Alternate fits and estimates of the levels."""
         for _ in range(_STEPS):
             self.set_base(judged)

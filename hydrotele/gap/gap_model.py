@@ -115,12 +115,21 @@ class GapModel(Protocol):
         """Whiten the errors of later guesses with the gains of this one; return it."""
         ...
 
+    def compact(self, judged: Judged) -> Judged:
+        """Return a model without what `set_base` can compute again, so that it needs little memory."""
+        return judged
+
     def fit(self, guess: Guess, steps: int) -> Fit:
         """Fit the parameters of some effects with the gains of the base."""
         ...
 
-    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
-        """Alternate fits and estimates of the noise levels until neither changes; the result is the base."""
+    def settle(self, judged: Judged, wanted: float = np.inf) -> tuple[Judged, Fit]:
+        """Alternate fits and estimates of the noise levels until neither changes; the result is the base.
+
+        Args:
+            judged: the model.
+            wanted: a loss; a model that does not approach it is not fitted to the end.
+        """
         ...
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:

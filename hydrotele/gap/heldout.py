@@ -45,7 +45,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
     """
     run, data = evidence.data.heldout, evidence.data
     free = [_select_run(h, d, run.name) for h, d in found.guess.parts]
-    other = Evidence(data, (run,), 1, evidence.step, lacking=True)
+    other = Evidence(data, (run,), evidence.jobs, evidence.step, lacking=True)
     model = MachineModel(other)
     try:
         own = other.set_base(Guess(tuple(free)))
@@ -67,7 +67,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         other.set_base(held.judged)
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if is_pulse(c)]
-        _, _, last = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
+        last, _, _ = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
         if not last.fit:  # nothing, or coloured noise
             return HeldOut(found, spread, ())
         sizes, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []

@@ -118,6 +118,14 @@ def smooth_basis(counts: tuple[int, ...]) -> tuple[np.ndarray, tuple[np.ndarray,
     return basis, tuple(root(basis.T @ covariance(length) @ basis) for length in lengths)
 
 
+def states_after_rows(machine: Machine, track: Track) -> np.ndarray:
+    """Simulate a machine over one row from each of a track's states; return the states (n, nz) at the ends."""
+    model, later = reduced_model(machine, ()), np.empty(track.states.shape)
+    steps = steps_per_row(machine, track.run.period, STEP)
+    _rows_later(model, model_space(model), track.states, track.run.command, track.run.period, steps, later)
+    return later
+
+
 @dataclass(frozen=True)
 class LawForm:
     """What a law adds to which balance, up to its K coefficients.
@@ -176,8 +184,14 @@ class LawForm:
             found = found * (form.sign * form.along(values, self.constants))[:, None]
         return np.nan_to_num(found)
 
-    def unit_changes(self, machine: Machine, track: Track) -> np.ndarray:
-        """Return what a unit of the balance, held over a row, changes in the states after it (n, nz)."""
+    def unit_changes(self, machine: Machine, track: Track, unchanged: np.ndarray | None = None) -> np.ndarray:
+        """Return what a unit of the balance, held over a row, changes in the states after it (n, nz).
+
+        Args:
+            machine: the model.
+            track: of it, which states the rows.
+            unchanged: `states_after_rows` of both, where they are known.
+        """
         step = _TYPICAL * float(input_sizes(machine, [Input(self.sides[0][0], self.axis)])[0])
         added = [
             Term.model_validate({
@@ -186,13 +200,10 @@ class LawForm:
             })
             for side, sign in self.sides
         ]  # fmt: skip
-        ends = []
-        for one in (machine, machine.model_copy(update={"terms": (*machine.terms, *added)})):
-            model, later = reduced_model(one, ()), np.empty(track.states.shape)
-            steps = steps_per_row(one, track.run.period, STEP)
-            _rows_later(model, model_space(model), track.states, track.run.command, track.run.period, steps, later)
-            ends.append(later)
-        return np.nan_to_num(ends[1] - ends[0]) / step
+        if unchanged is None:
+            unchanged = states_after_rows(machine, track)
+        changed = states_after_rows(machine.model_copy(update={"terms": (*machine.terms, *added)}), track)
+        return np.nan_to_num(changed - unchanged) / step
 
     def columns(self, track: Track, seen: Seen, unit: np.ndarray) -> np.ndarray:
         """Return the change (n c, q) of a track's whitened errors per unit of each function of `basis`.

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,14 +18,16 @@ from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
 from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
 from hydrotele.gap.gap_model import GapModel
-from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs
+from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs, states_after_rows
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
 from hydrotele.machine.machine import Machine
 
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log
 _REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distance
-_SECONDS = 12.0  # s of each run that the linear step uses; the refinement uses all
+LINEAR_STEP_SECONDS = 12.0
+"""Seconds of each run that the linear step uses; the refinement uses all."""
+_LEAST_GAIN = 0.01  # twice the log likelihood: parameters within a tenth of their standard deviations
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 
 
@@ -64,13 +66,18 @@ class MachineModel(GapModel):
         """Set the base of later errors."""
         return self.evidence.set_base(judged)
 
+    def compact(self, judged: Judged) -> Judged:
+        """Leave out gains and Jacobians."""
+        return judged.compact()
+
     def fit(self, guess: Guess, steps: int) -> Fit:
         """Fit with the gains of the base."""
         return self.evidence.fit(guess, 0.0, steps=steps, step=MIDDLE)
 
-    def settle(self, judged: Judged) -> tuple[Judged, Fit]:
+    def settle(self, judged: Judged, wanted: float = np.inf) -> tuple[Judged, Fit]:
         """Alternate fits and estimates of the noise levels."""
-        return rescale_between_runs(*fit_until_settled(self.evidence, judged), self.evidence.runs)
+        found = fit_until_settled(self.evidence, judged, wanted, _LEAST_GAIN)
+        return rescale_between_runs(*found, self.evidence.runs)
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension on the nonlinear filter and re-estimate its noise levels."""
@@ -174,9 +181,9 @@ class MachineModel(GapModel):
             colours = (Colour(c, float(size), rows * period) for c, size in enumerate(shares * total))
             return with_noise(shares * total, tuple(colours))
 
-        common = {rows: first_order(rows) for rows in _CORRELATION_ROWS}
+        common = {rows: first_order(rows).compact() for rows in _CORRELATION_ROWS}
         best_rows = min(common, key=lambda rows: charged_score(common[rows]))
-        common |= {rows: first_order(rows) for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
+        common |= {rows: first_order(rows).compact() for rows in (best_rows / _REFINEMENT, best_rows * _REFINEMENT)}
         found = [judged, *common.values()]
         if levels.colours:
             white = with_noise(total, ())
@@ -196,13 +203,23 @@ def is_irrelevant(hypothesis: Hypothesis, deviation: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class FilterLinearisation:
-    """Columns of the linearised filter, see `gap.gap_model.Linearisation`."""
+    """Columns of the linearised filter, see `gap.gap_model.Linearisation`.
+
+    Attributes:
+        evidence: the runs.
+        machine: the model.
+        tracks: of the first seconds of each run.
+        table: the columns.
+        fraction: of the rows that the columns hold.
+        units: balance and axis -> what a unit changes in the states of each track.
+    """
 
     evidence: Evidence
     machine: Machine
     tracks: Sequence[Track]
     table: Dictionary
     fraction: float
+    units: dict[tuple[str, str], list[np.ndarray]] = field(default_factory=dict)
 
     @property
     def versions(self) -> Sequence[Version]:
@@ -225,8 +242,13 @@ class FilterLinearisation:
         return self.table.parameters
 
     @cached_property
+    def unchanged_runs(self) -> list[np.ndarray]:
+        """States of the model a row after those of each track, for the changes that laws make."""
+        return self.evidence.map(lambda track: states_after_rows(self.machine, track), self.tracks)
+
+    @cached_property
     def seen_runs(self) -> list[Seen]:
-        """What the smoother says of each run."""
+        """Variables of each run."""
         return [see_run(self.machine, self.evidence.data, track) for track in self.tracks]
 
     def list_laws(self, judged: Judged, effects: Collection[str], has_laws: bool) -> list[LawForm]:
@@ -239,7 +261,15 @@ class FilterLinearisation:
 
     def with_laws(self, laws: Sequence[LawForm]) -> "FilterLinearisation":
         """Return the same with the columns of laws."""
-        table = self.table.with_laws(laws, self.machine, self.tracks, self.seen_runs, self.evidence.map)
+        new = {(law.balance, law.axis): law for law in laws if (law.balance, law.axis) not in self.units}
+        tracks, unchanged_runs, each = self.tracks, self.unchanged_runs, self.evidence.map
+
+        def change(law: LawForm) -> list[np.ndarray]:
+            pairs = zip(tracks, unchanged_runs, strict=True)
+            return [law.unit_changes(self.machine, track, unchanged) for track, unchanged in pairs]
+
+        self.units.update(zip(new, each(change, list(new.values())), strict=True))
+        table = self.table.with_laws(laws, self.units, tracks, self.seen_runs, each)
         return dataclasses.replace(self, table=table)
 
     def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
@@ -273,7 +303,7 @@ class FilterLinearisation:
 
 def _first_seconds(track: Track) -> Track:
     """Return the first seconds of a linearised track, with its transition Jacobians."""
-    rows = round(_SECONDS / track.run.period)
+    rows = round(LINEAR_STEP_SECONDS / track.run.period)
     first = dataclasses.replace(first_rows(track, rows), flow=track.flow[:rows])
     there = np.isfinite(first.whitened)
     loss = float(np.sum(first.whitened[there] ** 2 + 2.0 * np.log(first.gains.spread[there])))

@@ -11,7 +11,7 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,7 +54,7 @@ _LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
 _TRIED = 4  # candidates that are refined in each round
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
-_CLOSE = 100.0  # twice the log Bayes factor; a rival that is farther behind is not fitted to the end
+_CLOSE = 100.0  # twice the log Bayes factor; a rival that stays farther behind is not fitted to the end
 _KEPT = 50  # effects that are linearised again after the first round
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
 _MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
@@ -99,11 +99,16 @@ class Model:
 
 @dataclass(frozen=True)
 class Round:
-    """A round of the search: the model before and after, and the other refined models."""
+    """A round of the search: the model before and after, and the other refined models, all compact."""
 
     before: Model
     after: Model
     others: tuple[Model, ...]
+
+
+def compact(model: GapModel, one: Model) -> Model:
+    """Return a model that needs little memory; `GapModel.set_base` computes again what it lacks."""
+    return replace(one, judged=model.compact(one.judged))
 
 
 def keys_of(model: Model) -> set[tuple[str, str]]:
@@ -163,15 +168,14 @@ def search_model(
     given = Model(settle_noise(model, model.judge(Guess())))
     model.keep(given.judged)
     candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
-    rounds, first, now = add_effects(model, given, candidates, has_laws, tell)
-    given = rounds[0].before if rounds else now
+    now, rounds, first = add_effects(model, given, candidates, has_laws, tell)
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
     tell("remove unnecessary effects", 0.87)
-    now, rests = remove_needless(model, given, now, rounds)
+    now, rests = remove_needless(model, rounds[0].before if rounds else given, now, rounds)
     tell("compare alternative effects", 0.9)
     now, rests, rivals = exchange(model, now, rests, rounds)
-    model.set_base(now.judged)
+    now = replace(now, judged=model.set_base(now.judged))
     charges = tuple(
         occam_penalty(moved_last(now.fit.information, now.guess, k), h.size) if now.fit else 0.0
         for k, h in enumerate(now.guess.hypotheses)
@@ -188,7 +192,7 @@ def search_model(
 
 def add_effects(
     model: GapModel, now: Model, candidates: Sequence[Hypothesis], has_laws: bool, tell: Progress
-) -> tuple[list[Round], tuple[Proposal, ...], Model]:
+) -> tuple[Model, list[Round], tuple[Proposal, ...]]:
     """Add effects, laws, the calibration, coloured noise and differences between runs as long as each brings enough.
 
     Args:
@@ -199,7 +203,7 @@ def add_effects(
         tell: called with (what is done, fraction done).
 
     Returns:
-        The rounds, the proposals of the first one, and the last model, which is the base.
+        The model, the rounds, and the proposals of the first one.
     """
     quantities, effects = model.list_quantities(candidates), list(dict.fromkeys(c.name for c in candidates))
     first = tuple[Proposal, ...]()
@@ -223,10 +227,11 @@ def add_effects(
         if not better.charged_score < now.charged_score:
             break
         settled = settle(model, better)
-        rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
+        rivals = tuple(compact(model, m) for m in models if m is not better)
+        rounds.append(Round(compact(model, now), compact(model, settled), rivals))
         now = settled
         model.keep(now.judged)
-    return rounds, first, now
+    return now, rounds, first
 
 
 def renew_noise(model: GapModel, now: Model, better: Model) -> Model:
@@ -259,17 +264,22 @@ def settle_noise(model: GapModel, judged: Judged) -> Judged:
     return model.set_base(judged)
 
 
-def settle(model: GapModel, one: Model) -> Model:
+def settle(model: GapModel, one: Model, wanted: float = np.inf) -> Model:
     """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base.
 
     The prior of a law was selected while residual inputs hid a part of it. It is selected again as long as that brings
     evidence.
+
+    Args:
+        model: the data.
+        one: the model.
+        wanted: a score; a model that does not approach it is not fitted to the end.
     """
     if not one.guess.parts:
         return Model(settle_noise(model, one.judged))
-    found = _settle_fit(model, one.judged)
-    while any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
-        again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True))
+    found = _settle_fit(model, one.judged, wanted - one.penalty)
+    while found.score < wanted and any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
+        again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True), np.inf)
         if again.score > found.score - _SETTLED:
             model.set_base(found.judged)
             break
@@ -277,8 +287,8 @@ def settle(model: GapModel, one: Model) -> Model:
     return found
 
 
-def _settle_fit(model: GapModel, judged: Judged) -> Model:
-    judged, fit = model.settle(judged)
+def _settle_fit(model: GapModel, judged: Judged, wanted: float) -> Model:
+    judged, fit = model.settle(judged, wanted)
     return Model(settle_noise(model, judged), fit, fit.whole_penalty)
 
 
@@ -436,12 +446,17 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 
 
 def extensions(model: GapModel, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
-    """Refine the best proposals that the linear step holds for better than the model."""
+    """Refine the best proposals that the linear step holds for better than the model; all but the best are compact."""
     better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
     chosen = [p for p in better if not p.law][:_TRIED]
     laws = {p.law.kind: p for p in reversed(better) if p.law}
     chosen += laws.values()
-    return [m for m in (refine(model, now, p) for p in chosen) if m is not None]
+    found: list[Model] = []
+    for proposal in chosen:
+        if (refined := refine(model, now, proposal)) is not None:
+            best = min((*found, refined), key=lambda m: m.charged_score)
+            found = [m if m is best else compact(model, m) for m in (*found, refined)]
+    return found
 
 
 def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
@@ -511,7 +526,7 @@ def without_part(model: GapModel, given: Model, now: Model, index: int, rounds: 
         if keys_of(known.before) == {h.key for h in guess.hypotheses} and known.before.colours == now.colours:
             return known.before
     model.set_base(now.judged)
-    rest = settle(model, Model(model.judge(guess, reopened=True)))
+    rest = compact(model, settle(model, Model(model.judge(guess, reopened=True))))
     model.set_base(now.judged)
     return rest
 
@@ -556,7 +571,9 @@ def exchange(
         ]  # fmt: skip
         models = sorted((m for m in models if m.score < rest.score), key=lambda m: m.score)[:_RIVALS]
         models = [
-            settle(model, m) if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken) else m
+            compact(model, settle(model, m, now.score + _CLOSE))
+            if m.score < now.score + _CLOSE or is_of_family(m, hypothesis, taken)
+            else m
             for m in models
         ]
         models.sort(key=lambda m: m.score)
@@ -595,7 +612,7 @@ def add_rival(model: GapModel, rest: Model, origin: Round, other: Model) -> Mode
             guess = guess.plus(hypothesis, deviation)
     model.set_base(rest.judged)
     fit = model.fit(guess, 2)
-    return Model(model.judge(fit.guess), fit, fit.whole_penalty)
+    return compact(model, Model(model.judge(fit.guess), fit, fit.whole_penalty))
 
 
 def _rival(model: Model, rest: Model) -> Rival:

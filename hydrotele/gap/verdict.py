@@ -88,7 +88,7 @@ def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOu
             sizes = np.sqrt(np.nanmean((found.each / given.tracks[0].levels.whole_noise) ** 2, axis=1))
         return np.log(np.clip(sizes, 1.0, _LOST))
 
-    losses = [loss(judged) for judged in (given, final)]
+    losses = evidence.map(loss, (given, final))
     windows = evidence.map(errors, (given, final))
     change = windows[1] - windows[0]
     change = change[np.isfinite(change)]

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from numba.core.errors import TypingError
 
 import hydrotele
 from hydrotele.core.compile_progress import format_bar
-from hydrotele.core.compiled import compile_without_allocation
+from hydrotele.core.compiled import compile_without_allocation, compiled
 
 
 @compile_without_allocation
@@ -49,6 +50,36 @@ def test_lean_functions_that_create_or_return_arrays_are_refused():
         _creates(3)
     with pytest.raises(TypingError, match="array passed into"):
         _returns_part(np.ones(3))
+
+
+class _SixArrays(NamedTuple):
+    """More native arguments than a named tuple that is passed by value."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    e: np.ndarray
+    f: np.ndarray
+
+
+@compiled
+def _sum_of_ends(arrays):
+    return arrays.a[0] + arrays.f.copy()[0]
+
+
+@compile_without_allocation
+def _sum_of_ends_without_allocation(arrays):
+    return arrays.a[0] + arrays.f[0]
+
+
+@pytest.mark.parametrize("function", [_sum_of_ends, _sum_of_ends_without_allocation])
+def test_arrays_of_large_named_tuples_are_released_after_a_call(function):
+    arrays = _SixArrays(*np.ones((6, 3)))
+    before = [sys.getrefcount(values) for values in arrays]
+    for _ in range(10):
+        assert function(arrays) == 2.0
+    assert [sys.getrefcount(values) for values in arrays] == before
 
 
 PACKAGE = Path(hydrotele.__file__).parent

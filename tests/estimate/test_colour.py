@@ -91,3 +91,15 @@ def test_coloured_noise_is_proposed_for_its_channel_and_raises_the_likelihood(ri
         assert colour.size == pytest.approx(2e4, rel=0.3)  # 1000 readings with a correlation time of 8 rows
         evidence.set_base(found)
         assert propose_colours(rig, found.tracks, 20.0) is None
+
+
+def test_a_compact_model_is_linearised_again_when_it_becomes_the_base(rig):
+    with closing(Evidence(rig, rig.fit, 1, lacking=True)) as evidence:
+        given = evidence.set_base(evidence.judged(Guess()))
+        (track,), (small,) = given.tracks, given.compact().tracks
+        assert small.is_compact and not small.flow.size and not small.gains.gain.size and not small.columns.size
+        evidence.set_base(evidence.judged_from(Guess(), Levels(np.array([4e-5, 2e4, 2e4]))))
+        again = evidence.set_base(given.compact())
+        assert again.loss == pytest.approx(given.loss, abs=1.0)  # Jacobians of another pass
+        assert again.tracks[0].flow.shape == track.flow.shape
+        np.testing.assert_allclose(again.tracks[0].states, track.states, rtol=1e-3, atol=1e-6)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hydrotele.estimate.filter import multiply_symmetric, multiply_transposed
 from hydrotele.estimate.levels import LinearRun, smooth
 
 ROWS, CHANNELS, SIZE = 40, 2, 3
@@ -87,3 +88,15 @@ def test_the_slope_along_jitter_is_that_of_differences(made):
     slope = (losses[0] - losses[1]) / (2.0 * step)
     assert found.jitter_slope == pytest.approx(slope, rel=1e-5)
     assert smooth(run, noise, drift).jitter_slope == 0.0
+
+
+@pytest.mark.parametrize("size", [3, 4, 10])
+def test_products_in_blocks_of_four_rows_are_numpys(size):
+    rng, out = np.random.default_rng(1), np.empty((size, size))
+    left = np.where(rng.random((size, size)) < 0.5, rng.normal(size=(size, size)), 0.0)
+    root = rng.normal(size=(size, size))
+    multiply_transposed(left, root, out)
+    np.testing.assert_allclose(out, left.T @ root, atol=1e-12)
+    multiply_symmetric(root, np.ascontiguousarray(root.T), out)
+    np.testing.assert_allclose(out, root @ root.T, atol=1e-12)
+    np.testing.assert_array_equal(out, out.T)
