@@ -107,7 +107,7 @@ class Round:
 
 
 def compact(model: GapModel, one: Model) -> Model:
-    """Return a model that needs little memory; `GapModel.set_base` computes again what it lacks."""
+    """Return a model that needs little memory; `GapModel.set_base` computes the rest again."""
     return replace(one, judged=model.compact(one.judged))
 
 
@@ -264,7 +264,7 @@ def settle_noise(model: GapModel, judged: Judged) -> Judged:
     return model.set_base(judged)
 
 
-def settle(model: GapModel, one: Model, wanted: float = np.inf) -> Model:
+def settle(model: GapModel, one: Model, target: float = np.inf) -> Model:
     """Alternate fits and estimates of the noise levels until neither changes; the model becomes the base.
 
     The prior of a law was selected while residual inputs hid a part of it. It is selected again as long as that brings
@@ -273,12 +273,12 @@ def settle(model: GapModel, one: Model, wanted: float = np.inf) -> Model:
     Args:
         model: the data.
         one: the model.
-        wanted: a score; a model that does not approach it is not fitted to the end.
+        target: a score; a model that does not approach it is not fitted to the end.
     """
     if not one.guess.parts:
         return Model(settle_noise(model, one.judged))
-    found = _settle_fit(model, one.judged, wanted - one.penalty)
-    while found.score < wanted and any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
+    found = _settle_fit(model, one.judged, target - one.penalty)
+    while found.score < target and any(isinstance(h, LawHypothesis) for h in found.guess.hypotheses):
         again = _settle_fit(model, model.judge(model.select_priors(found.guess), same=True), np.inf)
         if again.score > found.score - _SETTLED:
             model.set_base(found.judged)
