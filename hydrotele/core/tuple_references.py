@@ -182,4 +182,11 @@ def _unbox_reference(kind, value, c):
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)
     _store_fields(c.context, c.builder, kind.record, native.value, space)
-    return NativeValue(_hide_origin(c.builder, space), native.is_error, native.cleanup)
+
+    def release() -> None:
+        """Emit code that releases the arrays after the call: a reference, an opaque pointer, does not do it."""
+        if native.cleanup is not None:
+            native.cleanup()
+        c.context.nrt.decref(c.builder, kind.record, native.value)
+
+    return NativeValue(_hide_origin(c.builder, space), native.is_error, release)
