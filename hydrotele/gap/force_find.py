@@ -19,15 +19,14 @@ from threadpoolctl import threadpool_limits
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.mjcf import read_mjcf
-from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess
+from hydrotele.estimate.hypothesis import Guess
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
 from hydrotele.gap.find import Progress, verdict_of, without_details
 from hydrotele.gap.force_columns import ForceEffect, force_effects
-from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, calibration_of, estimate_noise
+from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
     TYPICAL,
@@ -111,9 +110,9 @@ class _Task(NamedTuple):
         return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
 
     def effects_of(self, guess: Guess) -> list[tuple[ForceEffect, np.ndarray]]:
-        """Accepted effects with their parameter values, without the calibration."""
+        """Accepted effects with their parameter values."""
         return [(h, np.array(list(h.values(d).values()))) for h, d in guess.parts
-                if h.name != CALIBRATION and isinstance(h, ForceEffect)]  # fmt: skip
+                if isinstance(h, ForceEffect)]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,8 @@ class _Result:
     """A model, fitted, and what the held-out run says of it.
 
     Attributes:
-        guess: the model.
-        judged: on the fitted runs.
+        judged: the model on the fitted runs.
+        calibration: uncertain parameter -> its change and standard deviation, if they bring evidence.
         patched: the MJCF with it.
         then: held-out columns of the given model.
         now: of the patched one.
@@ -130,6 +129,7 @@ class _Result:
     """
 
     judged: Judged
+    calibration: Mapping[str, tuple[float, float]]
     patched: MechanismModel
     then: Columns
     now: Columns
@@ -234,7 +234,7 @@ def find_force_gap(
             for drive, a, b, std in zip(task.drives, *rms, shape.std, strict=True)
         }},
         law_units={"force": task.unit(task.drives[0])}, tests=_tests(result),
-        calibration=_calibration(task, evidence, result.judged), lacks=lacks,
+        calibration=_calibration(task, result), lacks=lacks,
         noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
         notes=(*notes, *untrue, *more), answers=tuple(answer_document(named)),
         explanation=VerdictExplanation(
@@ -245,15 +245,16 @@ def find_force_gap(
     )  # fmt: skip
 
 
-def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> ForceEffect:
-    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping, as one group.
+def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> dict[str, float]:
+    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping.
 
     Args:
         mechanism: the model.
         nominal: of `nominal_parameters`.
 
     Returns:
-        The group. Moments and products of inertia are uncertain relative to the body's mass and size.
+        Parameter -> standard deviation. Moments and products of inertia are uncertain relative to the body's mass and
+        size.
     """
     off, chain, std = mechanism.mapping.relative_uncertainty, mechanism.setup.chain, {}
     for body, ten in zip(chain.bodies, chain.inertia, strict=True):
@@ -261,20 +262,16 @@ def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> 
         reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
         for kind in BODY_PARAMETERS:
             std[f"{kind}.{body}"] = mass if kind == "mass" else reach if kind.startswith("moment") else spread
-    table = {}
-    for name, value in nominal.items():
-        width = off * std.get(name, abs(value))
-        if width > 0.0:
-            table[name] = Parameter(parameter_unit(mechanism, name), value, -np.inf, np.inf, width, 0.0)
-    return calibration_of(table)
+    sizes = {name: off * std.get(name, abs(value)) for name, value in nominal.items()}
+    return {name: size for name, size in sizes.items() if size > 0.0}
 
 
 def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
     """Return what no model knows: column -> standard deviation.
 
-    How dry friction acts near rest, and how sharply it turns.
+    How dry friction acts near rest, how sharply it turns, and where between two rows forces and positions were read.
     """
-    form: dict[str, float] = {}
+    form = {"delay.force": 0.5 * columns.row}
     for one in mechanism.setup.friction_terms:
         dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
         if one.location in columns.drives and dry > 0.0:
@@ -300,7 +297,7 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
         known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
-        value = evidence.coefficients(found.guess)
+        value = evidence.changes(found.judged)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
         steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
                  / [p.prior_std for p in h.parameters.values()] for h, v in known]  # fmt: skip
@@ -310,11 +307,17 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
     return evidence, found
 
 
-def _evidence(task: _Task, columns: Columns, shape: NoiseShape | None = None) -> ForceEvidence:
-    return ForceEvidence(
-        columns, shape or estimate_noise(columns), uncertain_parameters(task.mechanism, task.nominal),
-        uncertain_form(task.mechanism, columns),
-    )  # fmt: skip
+def _evidence(task: _Task, columns: Columns) -> ForceEvidence:
+    form, uncertain = uncertain_form(task.mechanism, columns), uncertain_parameters(task.mechanism, task.nominal)
+    return ForceEvidence(columns, estimate_noise(columns), _root(columns, form), _root(columns, uncertain))
+
+
+def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
+    """(m, r) root of the covariance of independent coefficients of some columns, column -> standard deviation."""
+    out = np.zeros((len(columns.names), len(stds)))
+    for k, (name, std) in enumerate(stds.items()):
+        out[columns.names.index(name), k] = std
+    return out
 
 
 def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
@@ -357,7 +360,7 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
     last = columns.time.max()
     for hypothesis, deviation in judged.guess.parts:
-        if hypothesis.name == CALIBRATION or hypothesis.size > 1:
+        if hypothesis.size > 1:
             continue
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
@@ -378,11 +381,12 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
     """Patch the MJCF with a model and evaluate it on the held-out run."""
     mechanism, columns = task.mechanism, evidence.columns
     patched, now = task.given, then
-    if judged.guess.parts:
-        numbers = {
-            name: h.values(d)[name] - p.nominal for h, d in judged.guess.parts if h.name == CALIBRATION
-            for name, p in h.parameters.items()
-        }  # fmt: skip
+    calibration = {}
+    if evidence.calibration_gain(judged) > MIN_LOG_BAYES_FACTOR:
+        numbers = dict(zip(columns.names, zip(*evidence.calibration(judged), strict=True), strict=True))
+        calibration = {name: numbers[name] for name in uncertain_parameters(mechanism, task.nominal)}
+    if judged.guess.parts or calibration:
+        numbers = {name: change for name, (change, _) in calibration.items()}
         speeds = {joint: size[2] for joint, size in columns.sizes.items()}
         patch = patch_of(
             task.effects_of(judged.guess), mechanism.setup.chain, mechanism.measured_joints, numbers, task.nominal,
@@ -395,17 +399,17 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
             write_mechanism(Path(folder), patched.mjcf, patched.mapping)
             better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
         now = build_columns([task.heldout], better, task.band, patch.errors)
-    heldout = _evidence(task, now, evidence.shape)
+    form = _root(now, uncertain_form(mechanism, now))
+    heldout = ForceEvidence(now, evidence.shape, form, evidence.uncertainty(judged), (1.0,))
     sizes = []
     for one, own in ((evidence, judged), (heldout, heldout.judge(Guess()))):
         sizes.append(_missing_forces(one, own))
-    return _Result(judged, patched, then, now, np.array(sizes))
+    return _Result(judged, calibration, patched, then, now, np.array(sizes))
 
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
     """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
-    rest = evidence.columns.gap - evidence.force_of(judged.guess)
-    found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
+    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt)
     return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
 
 
@@ -421,19 +425,25 @@ def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float
 def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
     """Effect -> its probability, and those of its alternatives.
 
-    The probability against rivals and none is scaled with that of the fraction of the residual force's variance which
-    the effect explains, on the drive that it moves most.
+    The probability against rivals and none is scaled with that of the fraction of the variance of the missing force
+    that the effect explains, on the drive that it moves most.
     """
     out = {}
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
         rest = found.without[index]
-        if hypothesis.name == CALIBRATION or rest is None:
+        if rest is None:
             continue
-        rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
-        table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
-        moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
-        own = int(np.argmax(moved / evidence.shape.std))
-        now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, rest))
+        rivals = [
+            replace(r, occam_penalty=r.occam_penalty + _penalty(r.judged) - _penalty(rest))
+            for r in found.rivals[index] if np.isfinite(r.judged.loss)
+        ]  # fmt: skip
+        charge = found.charges[index] + _penalty(found.judged) - _penalty(rest)
+        table = effect_probabilities(found.judged, charge, rest, rivals)
+        force = evidence.force_of(Guess(((hypothesis, deviation),)))
+        own = int(np.argmax(np.sqrt(np.mean(force**2, axis=0)) / evidence.shape.std))
+        back = evidence.remaining_force(found.judged) + force
+        without = evidence.shape.missing_forces(back, evidence.columns.doubt)[own] ** 2
+        now = _missing_forces(evidence, found.judged)[own] ** 2
         trust = believed_part(1.0 - now / without if without > now else 0.0)
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
@@ -441,6 +451,11 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         )  # fmt: skip
         out[hypothesis.key] = trust * float(table[0]), others
     return out
+
+
+def _penalty(judged: Judged) -> float:
+    """Cost of the noise levels and of the marginalised parameters, which the blocks of the runs do not hold."""
+    return judged.tracks[0].levels.penalty
 
 
 def _describe_effects(
@@ -458,8 +473,6 @@ def _describe_effects(
     for hypothesis, deviation in guess.parts:
         std = spread[first : first + hypothesis.size]
         first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            continue
         force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
         added = shape.weights(then.doubt)[:rows] * force / shape.std
         back = float(np.mean((after + added) ** 2) - np.mean(after**2))
@@ -474,18 +487,14 @@ def _describe_effects(
     return tuple(sorted(named, key=lambda e: (-round(e.probability, 3), -e.share)))
 
 
-def _calibration(task: _Task, evidence: ForceEvidence, judged: Judged) -> dict[str, Estimate]:
+def _calibration(task: _Task, result: _Result) -> dict[str, Estimate]:
     """Calibrated parameters that differ from the MJCF."""
-    told, first = {}, 0
-    spread = np.sqrt(np.diag(evidence.covariance(judged))) if judged.guess.parts else np.zeros(0)
-    for hypothesis, deviation in judged.guess.parts:
-        own = spread[first : first + hypothesis.size]
-        first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            for (name, p), d, s in zip(hypothesis.parameters.items(), deviation, own, strict=True):
-                value, reach = p.nominal + d * p.prior_std, _NORMAL95 * s * p.prior_std
-                if abs(d) > _DISTINCT * s:
-                    told[name] = Estimate(value, p.unit, value - reach, value + reach, p.nominal)
+    told = {}
+    for name, (change, s) in result.calibration.items():
+        value, reach = task.nominal[name] + change, _NORMAL95 * s
+        if abs(change) > _DISTINCT * s:
+            unit = parameter_unit(task.mechanism, name)
+            told[name] = Estimate(value, unit, value - reach, value + reach, task.nominal[name])
     return told
 
 
@@ -514,7 +523,7 @@ def _predictions(
     """Predictions of the given or the patched model, the held-out run first."""
     channels, then, fit = _channels(task), result.then, evidence.columns
     error, doubt = (result.now.gap, result.now.doubt) if patched else (then.gap, then.doubt)
-    rest = fit.gap - evidence.force_of(result.judged.guess) if patched else fit.gap
+    rest = evidence.remaining_force(result.judged) if patched else fit.gap
 
     def prediction(run: str, time: np.ndarray, measured, error, doubt) -> Prediction:
         return Prediction(run, time, channels, measured - error, measured, shape.weights(doubt) * error / shape.std)
@@ -587,7 +596,7 @@ def _traces(task: _Task, evidence: ForceEvidence, result: _Result) -> tuple[Inpu
     """Force errors of the drive whose error is largest, over the first fitted run, with what the model adds."""
     columns = evidence.columns
     rows = slice(columns.starts[0], columns.starts[1])
-    added = evidence.force_of(result.judged.guess)[rows]
+    added = columns.gap[rows] - evidence.remaining_force(result.judged)[rows]
     order = np.argsort(-np.sqrt(np.mean(columns.gap**2, axis=0)) / evidence.shape.std)
     return tuple(
         InputTrace(
