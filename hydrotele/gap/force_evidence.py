@@ -25,7 +25,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
 from scipy.optimize import minimize
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
+from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Fit, Judged, fit_guess, invert_information, sandwich_variances
 from hydrotele.estimate.filter import MEMORY, Gains, Input
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
@@ -35,7 +37,7 @@ from hydrotele.gap.dictionary import Version
 from hydrotele.gap.force_columns import ForceEffect
 from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm
-from hydrotele.gap.mechanism_columns import TYPICAL, Columns, strengths
+from hydrotele.gap.mechanism_columns import LEAST, TYPICAL, Columns, strengths
 from hydrotele.gap.model_search import PARAMETER_SCALES
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
@@ -44,6 +46,7 @@ MAX_SIGN_DOUBT = 0.25  # doubt of the sign of dry friction, beyond which a drive
 _ORDER_SHARE = 1.0 / 3.0  # of that time, which the autoregression of the noise may span: it must not follow the motion
 _LEAST_NOISE = 0.01  # fraction of the variance of the errors that is noise at least
 _NOISE_ROUNDS = 3  # of estimating noise and coefficients in turn
+_VARIANCE_ROUNDS = 10  # of Fisher scoring: a few rows where friction changes sign have errors a hundred times larger
 _EFFECTS_PER_DRIVE = 3  # rounds of a search: Coulomb and viscous friction and one more of each drive
 _MIN_EFFECTS = 8  # rounds
 _NOISE_WIDTH = 0.25  # of the log of a noise level: the residual of all columns tells it within some 25 %
@@ -51,6 +54,9 @@ _RESIDUAL_WIDTH = 4.0  # of the log of a residual force's size, in units of the 
 _LOG_SIZES = (-6.0, 9.0)  # between which that log is looked for
 _STEPS = 6  # Gauss-Newton steps
 _SETTLED = 1.0  # twice the log likelihood; a smaller change ends the alternation of fits and noise levels
+_INSTANTS = 300  # of a run at which a pulse may start or end
+_LEAST_PULSE = 20.0  # twice the log likelihood that a residual force must bring where a pulse is looked for
+_MAX_PULSE = 20.0  # typical sizes
 _LEVEL_ROUNDS = 2  # of estimating the marginalised parameters and the noise levels in turn
 _LEAST_INFORMATION = 1e-3  # of a combination of uncertain parameters, in units of its prior's; the data say nothing
 _KNOTS = {1: 12, 2: 7}  # hat functions of a law along each of its one or two variables
@@ -161,7 +167,7 @@ def typical_sizes(columns: Columns) -> np.ndarray:
 def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     """Shape of a residual (n, k), of which a fraction is left by the parameters that were fitted."""
     drives = rest.shape[1]
-    variances = estimate_error_variances(rest, columns.doubt)
+    variances = estimate_error_variances(rest, columns.doubt, _VARIANCE_ROUNDS)
     plain = NoiseShape(np.zeros((0, drives)), np.eye(drives), variances, np.ones(drives))
     weight, starts = plain.weights(columns.doubt), columns.starts
     order = max(1, int(_ORDER_SHARE * MEMORY / columns.spacing))
@@ -172,8 +178,26 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     there = np.concatenate([weight[a + order : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])
     fewer = [max(0, a - order * run) for run, a in enumerate(starts)]
     between = _fast_covariance(new, there.astype(float), fewer, order, columns.spacing)[0] / free
-    size, ways = np.linalg.eigh(between)
-    return plain._replace(white=(ways / np.sqrt(np.maximum(size, 1e-12 * size.max()))) @ ways.T)
+    ratio = np.sqrt(_usual_fraction(new, there, fewer, max(1, round(MEMORY / columns.spacing))))
+    size, ways = np.linalg.eigh(between * np.outer(ratio, ratio))
+    white = (ways / np.sqrt(np.maximum(size, 1e-12 * size.max()))) @ ways.T
+    return plain._replace(white=white, std=ratio * plain.std)
+
+
+def _usual_fraction(new: np.ndarray, there: np.ndarray, starts: Sequence[int], length: int) -> np.ndarray:
+    """Variance (k,) of most windows of innovations (n, k), as a fraction of the variance of all; at most 1.
+
+    A force that acts for a short time is no noise. Independent normal innovations have a fraction of 1.
+    """
+    edges = np.concatenate([np.arange(a, b, length) for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    squares, counts = np.add.reduceat(new**2 * there, edges), np.add.reduceat(there.astype(float), edges)
+    full = counts > 0.5 * length
+    out = np.ones(new.shape[1])
+    for k in range(new.shape[1]):
+        level = squares[full[:, k], k] / counts[full[:, k], k]
+        if level.size and level.mean() > 0.0:
+            out[k] = min(1.0, float(np.median(level) / level.mean()) * length / float(chi2.ppf(0.5, length)))
+    return out
 
 
 def _fast_covariance(
@@ -244,7 +268,7 @@ class ForceEvidence(GapModel):
 
     def __init__(
         self, columns: Columns, shape: NoiseShape, form: np.ndarray | None = None, uncertain: np.ndarray | None = None,
-        scales: Sequence[float] = PARAMETER_SCALES,
+        scales: Sequence[float] = PARAMETER_SCALES, has_pulses: bool = True,
     ) -> None:  # fmt: skip
         """Prepare the equations.
 
@@ -254,6 +278,7 @@ class ForceEvidence(GapModel):
             form: (m, r) root of the covariance of what is never known, along the columns: how friction acts near rest.
             uncertain: (m, r) root of the covariance of the uncertain parameters, along the columns.
             scales: factors on it, among which every guess has one.
+            has_pulses: whether force pulses are tried.
         """
         self.columns, self.shape, order = columns, shape, len(shape.follow)
         self.run_names = ()
@@ -270,8 +295,9 @@ class ForceEvidence(GapModel):
         self._first = np.zeros(len(self._kept), bool)
         self._first[self._edges[:-1][np.diff(self._edges) > 0]] = True
         self._place = {name: k for k, name in enumerate(columns.names)}
-        self._choices = scales
+        self._choices, self._has_pulses = scales, has_pulses
         empty = np.zeros((len(self._unit), 0))
+        self._prior_variance = np.sum(np.square(empty if uncertain is None else uncertain), axis=1)
         mixes = [self._keep_visible(empty if root is None else root) for root in (form, uncertain)]
         self._mix = np.concatenate(mixes, axis=1)
         self._is_form = np.arange(self._mix.shape[1]) < mixes[0].shape[1]
@@ -487,6 +513,85 @@ class ForceEvidence(GapModel):
             self, here, tuple(versions[k] for k in kept), [groups[k] for k in kept], moves, own,
         )  # fmt: skip
 
+    def compare_disturbances(
+        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        """Return the most likely force pulse on a drive with a residual force, in one run; its column is added.
+
+        A pulse is the difference of two steps, so the Gram matrix of steps at all instants gives the Bayes factor of
+        every interval.
+        """
+        self.set_base(judged)
+        lacking = np.flatnonzero(self.residual_gain(judged) > _LEAST_PULSE) if self._has_pulses else ()
+        left, best = self._left(judged), (0.0, 0.0, 0.0, 0, "", 0, 0)
+        for run, (a, b) in enumerate(zip(self.columns.starts[:-1], self.columns.starts[1:], strict=True)):
+            rows = slice(*self._edges[run : run + 2])
+            knots = np.unique(np.linspace(0, b - a, min(b - a, _INSTANTS), endpoint=False).astype(int))
+            for k in lacking:
+                steps = np.zeros((b - a, left.shape[1], len(knots)))
+                steps[:, k] = -self._pulse_size(k) * (np.arange(b - a)[:, None] >= knots)
+                series = self.shape.prewhiten(steps, self.columns.doubt[a:b], (0, b - a))
+                series = np.concatenate([series, left[rows, :, None]], axis=2)
+                for scale in scales:
+                    levels = _shrink_levels(self._levels, scale)
+                    whitened, spread = whiten_forces(
+                        series, self._missing[rows], self._first[rows], self._fade, levels.noise, levels.sizes
+                    )
+                    flat = whitened.reshape(-1, len(knots) + 1)
+                    square, right = flat[:, :-1].T @ flat[:, :-1], flat[:, :-1].T @ flat[:, -1]
+                    width = np.diag(square)
+                    precision = 1.0 + np.maximum(width[:, None] + width - 2.0 * square, 0.0)
+                    pull = right[:, None] - right
+                    factors = np.triu(pull**2 / precision - np.log(precision), 1)
+                    first, last = np.unravel_index(int(np.argmax(factors)), factors.shape)
+                    loss = float(flat[:, -1] @ flat[:, -1] + 2.0 * np.log(spread).sum())
+                    if scale == scales[0]:
+                        given = loss
+                    gain = given - loss + float(factors[first, last]) - _choice_cost(len(knots))
+                    if gain > best[0]:
+                        size = float(pull[first, last] / precision[first, last])
+                        best = gain, size, scale, k, self.columns.runs[run], a + knots[first], a + knots[last]
+        if not best[4]:
+            return []
+        gain, size, scale, drive, name, first, last = best
+        return [((self._pulse(judged.guess, drive, name, first, last), np.array([size])), gain, scale)]
+
+    def _pulse_size(self, drive: int) -> float:
+        """Typical size of a force pulse [N] or [N m]."""
+        return TYPICAL * float(np.sqrt(np.mean(self.columns.measured[:, drive] ** 2)))
+
+    def _pulse(self, guess: Guess, drive: int, run: str, first: int, last: int) -> ForceEffect:
+        """Force pulse on a drive from one row to another; its column becomes one of those of the runs."""
+        columns, name = self.columns, self.columns.drives[drive]
+        column = f"pulse.{name}.{first}.{last}"
+        if column not in self._place:
+            force = np.zeros((*columns.gap.shape, 1))
+            force[first:last, drive] = -1.0  # the drive needs less
+            size = self._pulse_size(drive)
+            white = self.shape.prewhiten(size * force, columns.doubt, columns.starts)
+            self._place[column] = len(columns.names)
+            self.columns = replace(
+                columns, names=(*columns.names, column), matrix=np.concatenate([columns.matrix, force], axis=2)
+            )
+            self._unit = np.append(self._unit, size)
+            self._values = np.concatenate([self._values[:, :, :-1], white, self._values[:, :, -1:]], axis=2)
+            self._mix = np.concatenate([self._mix, np.zeros((1, self._mix.shape[1]))])
+            self._prior_variance = np.append(self._prior_variance, 0.0)
+            self._roots.clear()
+            self._root, _ = self._root_of(self._levels)
+        place = f"{name}.{run}"
+        before = sum(h.location.startswith(place) for h in guess.hypotheses)
+        kind = columns.units[drive]
+        size, start = self._pulse_size(drive), float(columns.time[first])
+        least = LEAST / TYPICAL * size
+        bound = _MAX_PULSE * size
+        return ForceEffect(
+            "force_pulse", f"{place}.{before + 1}" if before else place,
+            {"size": Parameter(kind, 0.0, -bound, bound, size, least)}, None, (column,),
+            interval=(start, float(columns.time[last - 1]) + columns.spacing - start),
+            choice_cost=_choice_cost(min(int(np.sum(np.diff(columns.starts))), _INSTANTS)),
+        )  # fmt: skip
+
     def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:
         """Return None: the shape of the noise holds its colour."""
         return None
@@ -528,7 +633,8 @@ class ForceEvidence(GapModel):
         along, covariance = self._posterior(judged)
         count = len(judged.guess.deviation)
         own = along[:, count:] * ~self._is_form
-        spread = np.sqrt(np.einsum("mr,rs,ms->m", own, covariance[count:, count:], own))
+        hidden = np.maximum(self._levels.parameter_scale**2 * self._prior_variance - np.sum(own**2, axis=1), 0.0)
+        spread = np.sqrt(np.einsum("mr,rs,ms->m", own, covariance[count:, count:], own) + hidden)
         return self._unit * (self._mix[:, ~self._is_form] @ self._marginal_mean(judged)[~self._is_form]), spread
 
     def calibration_gain(self, judged: Judged) -> float:
@@ -617,6 +723,11 @@ class ForceLinearisation:
             groups = [np.hstack([groups[g] for g in joined])]
         errors = root @ self.along
         return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
+
+
+def _choice_cost(count: int) -> float:
+    """-2 log probability of one of the intervals between some instants, which are equally probable."""
+    return 2.0 * float(np.log(0.5 * count * (count - 1)))
 
 
 def _shrink_levels(levels: ForceLevels, ratio: float) -> ForceLevels:

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from hydrotele.core.errors import InputError
 from hydrotele.core.mjcf import read_mjcf
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import Guess
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
@@ -34,6 +34,7 @@ from hydrotele.gap.mechanism_columns import (
     Key,
     build_columns,
     common_band,
+    force_unit,
     undone,
 )
 from hydrotele.gap.mechanism_find import MechanismModel, nominal_parameters
@@ -60,12 +61,15 @@ from hydrotele.gap.result import (
     NamedEffect,
     Prediction,
     Rejection,
+    RunDifference,
     VerdictExplanation,
 )
 from hydrotele.gap.rivals import effect_probabilities
+from hydrotele.gap.run_differences import difference_words
 from hydrotele.gap.search import Found
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
+from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 MIN_FORCE_SHARE = 0.02
@@ -106,8 +110,7 @@ class _Task(NamedTuple):
         return tuple(self.mechanism.setup.chain.drives)
 
     def unit(self, joint: str) -> str:
-        chain = self.mechanism.setup.chain
-        return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
+        return force_unit(self.mechanism.setup.chain, joint)
 
     def effects_of(self, guess: Guess) -> list[tuple[ForceEffect, np.ndarray]]:
         """Accepted effects with their parameter values."""
@@ -126,6 +129,8 @@ class _Result:
         then: held-out columns of the given model.
         now: of the patched one.
         sizes: (2, k) residual forces of the fitted runs and of the held-out run [N] or [N m]; 0 where no evidence.
+        heldout: the held-out run with the patched model as the given one.
+        differences: what the held-out run has in addition.
     """
 
     judged: Judged
@@ -134,6 +139,8 @@ class _Result:
     then: Columns
     now: Columns
     sizes: np.ndarray
+    heldout: ForceEvidence
+    differences: tuple[RunDifference, ...] = ()
 
     def share(self) -> np.ndarray:
         """(2, k) residual forces over the RMS of the drives' forces."""
@@ -206,6 +213,7 @@ def find_force_gap(
             break
         judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in more})
         result = _evaluate(task, evidence, judged, then)
+    result = _compare_heldout(result, mechanism.setup.chain, nominal)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
     lacks = _lacks(task, result)
@@ -223,6 +231,7 @@ def find_force_gap(
     of_fit, of_heldout = result.is_lacking
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
              for k, drive in enumerate(task.drives) if of_heldout[k] and not of_fit[k]]  # fmt: skip
+    more += [difference_words(d) for d in result.differences]
     more += [words for effect in named if (words := answer_words(effect))]
     tell("done", 1.0)
     return Gap(
@@ -236,7 +245,7 @@ def find_force_gap(
         law_units={"force": task.unit(task.drives[0])}, tests=_tests(result),
         calibration=_calibration(task, result), lacks=lacks,
         noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
-        notes=(*notes, *untrue, *more), answers=tuple(answer_document(named)),
+        notes=(*notes, *untrue, *more), differences=result.differences, answers=tuple(answer_document(named)),
         explanation=VerdictExplanation(
             compare_contenders(found, named), _rejections(found, named, details, untrue),
             _traces(task, evidence, result),
@@ -266,14 +275,20 @@ def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> 
     return {name: size for name, size in sizes.items() if size > 0.0}
 
 
-def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
+def uncertain_form(mechanism: Mechanism, columns: Columns, about: Mapping[str, float]) -> dict[str, float]:
     """Return what no model knows: column -> standard deviation.
 
     How dry friction acts near rest, how sharply it turns, and where between two rows forces and positions were read.
+
+    Args:
+        mechanism: the given model.
+        columns: of the runs.
+        about: parameter -> how much it differs from the given one, as far as is known.
     """
     form = {"delay.force": 0.5 * columns.row}
     for one in mechanism.setup.friction_terms:
-        dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
+        found = about.get(f"coulomb.{one.location}", 0.0)
+        dry = abs(one.nominal.get("coulomb", 0.0) + found) + abs(one.nominal.get("stribeck", 0.0))
         if one.location in columns.drives and dry > 0.0:
             form |= {f"stribeck{number}.{one.location}": _FORM * dry for number in (0, 2)}
             form[f"sharpness.{one.location}"] = _SHARPNESS * dry
@@ -281,22 +296,26 @@ def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
 
 
 def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvidence, Found]:
-    """Search; take sensor errors off the readings and search again until nothing changes."""
+    """Search; search again about the effects on which the columns depend, until nothing changes.
+
+    These are sensor errors, which are taken off the readings, and dry friction, whose form near rest is uncertain.
+    """
     applied: dict[Key, np.ndarray] = {}
-    known: Sequence[tuple[ForceEffect, np.ndarray]] = ()
+    sensors: Sequence[tuple[ForceEffect, np.ndarray]] = ()
     chain, joints, about = task.mechanism.setup.chain, task.mechanism.measured_joints, {}
     for turn in range(_MAX_ROUNDS):
         begin = 0.9 * turn / _MAX_ROUNDS
         tell(f"compute the regressors of all effects, round {turn + 1}", begin)
-        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(known, chain, joints), about)
-        columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
+        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(sensors, chain, joints), about)
+        columns = undone(columns, {h.key: v for h, v in sensors}, {h.key: h.columns[0] for h, _ in sensors})
         effects = force_effects(chain, columns, task.nominal, applied)
         effects = [one for one in effects if not names or one.name in names]
-        evidence = _evidence(task, columns)
+        evidence = _evidence(task, columns, about, not names or "force_pulse" in names)
         found = search_model(
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
-        known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
+        sensors = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
+        known = [*sensors, *(pair for pair in task.effects_of(found.guess) if pair[0].name == "coulomb_friction")]
         value = evidence.changes(found.judged)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
         steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
@@ -307,9 +326,13 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
     return evidence, found
 
 
-def _evidence(task: _Task, columns: Columns) -> ForceEvidence:
-    form, uncertain = uncertain_form(task.mechanism, columns), uncertain_parameters(task.mechanism, task.nominal)
-    return ForceEvidence(columns, estimate_noise(columns), _root(columns, form), _root(columns, uncertain))
+def _evidence(
+    task: _Task, columns: Columns, about: Mapping[str, float], has_pulses: bool = False
+) -> ForceEvidence:  # fmt: skip
+    form, uncertain = uncertain_form(task.mechanism, columns, about), uncertain_parameters(task.mechanism, task.nominal)
+    return ForceEvidence(
+        columns, estimate_noise(columns), _root(columns, form), _root(columns, uncertain), has_pulses=has_pulses
+    )
 
 
 def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
@@ -322,9 +345,14 @@ def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
 
 def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     """Evidence on the readings as they are, and a search that found nothing."""
-    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band))
+    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band), {})
     judged = evidence.judge(Guess())
     return evidence, Found(judged, judged, None, (), (), (), (), None)
+
+
+def is_local(hypothesis: Hypothesis) -> bool:
+    """Return whether an effect acts in one run only, for a limited time."""
+    return isinstance(hypothesis, ForceEffect) and hypothesis.interval is not None
 
 
 def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
@@ -360,7 +388,7 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
     last = columns.time.max()
     for hypothesis, deviation in judged.guess.parts:
-        if hypothesis.size > 1:
+        if hypothesis.size > 1 or is_local(hypothesis):
             continue
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
@@ -399,12 +427,32 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
             write_mechanism(Path(folder), patched.mjcf, patched.mapping)
             better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
         now = build_columns([task.heldout], better, task.band, patch.errors)
-    form = _root(now, uncertain_form(mechanism, now))
-    heldout = ForceEvidence(now, evidence.shape, form, evidence.uncertainty(judged), (1.0,))
-    sizes = []
-    for one, own in ((evidence, judged), (heldout, heldout.judge(Guess()))):
-        sizes.append(_missing_forces(one, own))
-    return _Result(judged, calibration, patched, then, now, np.array(sizes))
+    form = _root(now, uncertain_form(mechanism, now, dict(zip(columns.names, evidence.changes(judged), strict=True))))
+    heldout = ForceEvidence(now, evidence.shape, form, evidence.uncertainty(judged)[: len(now.names)], (1.0,))
+    sizes = [_missing_forces(one, own) for one, own in ((evidence, judged), (heldout, heldout.judge(Guess())))]
+    return _Result(judged, calibration, patched, then, now, np.array(sizes), heldout)
+
+
+def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]) -> _Result:
+    """Find what the held-out run alone has, if forces are missing there only; the rest is missing in the model."""
+    of_fit, of_heldout = result.is_lacking
+    if not np.any(of_heldout & ~of_fit):
+        return result
+    evidence, run = result.heldout, result.now.runs[0]
+    found = search_model(evidence, force_effects(chain, result.now, nominal, {}))
+    spread, first, told = np.sqrt(np.diag(evidence.covariance(found.judged))), 0, []
+    for h, deviation in found.guess.parts:
+        for (name, p), value, s in zip(
+            h.parameters.items(), h.values(deviation).values(), spread[first:], strict=False
+        ):
+            place = h.location.removesuffix(f".{run}")
+            more = "start {:.4g} s, duration {:.4g} s".format(*h.interval) if is_local(h) else ""
+            sizes = {run: (value - p.nominal, float(s * p.prior_std))}
+            told.append(RunDifference(f"{h.name}.{place}.{name}", p.unit, math.nan, sizes, details=more))
+        first += h.size
+    return replace(
+        result, sizes=np.array([result.sizes[0], _missing_forces(evidence, found.judged)]), differences=tuple(told)
+    )
 
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
@@ -461,27 +509,40 @@ def _penalty(judged: Judged) -> float:
 def _describe_effects(
     task: _Task, evidence: ForceEvidence, result: _Result, chances: Mapping[Key, tuple[float, tuple[Alternative, ...]]]
 ) -> tuple[NamedEffect, ...]:  # fmt: skip
-    """Effects of a model with probabilities, intervals, and the fraction of the held-out gap that each closes."""
+    """Effects of a model with probabilities, intervals, and the fraction of the gap that each closes.
+
+    The gap is that of the held-out run, and of the drive that the effect moves most.
+    """
     guess, then, now = result.judged.guess, result.then, result.now
     if not guess.parts:
         return ()
     spread = np.sqrt(np.diag(evidence.covariance(result.judged)))
-    rows = min(len(then.time), len(now.time))
-    shape = evidence.shape
-    before, after = (shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now))
-    whole, first, named = float(np.mean(before**2)) - 1.0, 0, []
+    rows, shape, fit = min(len(then.time), len(now.time)), evidence.shape, evidence.columns
+    errors = [shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now)]
+    weight, rest = shape.weights(fit.doubt) / shape.std, evidence.remaining_force(result.judged)
+    first, named = 0, []
     for hypothesis, deviation in guess.parts:
         std = spread[first : first + hypothesis.size]
         first += hypothesis.size
-        force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
-        added = shape.weights(then.doubt)[:rows] * force / shape.std
-        back = float(np.mean((after + added) ** 2) - np.mean(after**2))
+        change = evidence.coefficients(Guess(((hypothesis, deviation),)))
+        if is_local(hypothesis):  # it acts in a fitted run
+            before, after, added = weight * fit.gap, weight * rest, weight * (fit.matrix @ change)
+        else:
+            force = then.matrix[:rows] @ change[: len(then.names)]
+            before, after = errors
+            added = shape.weights(then.doubt)[:rows] * force / shape.std
+        own = int(np.argmax(np.mean(added**2, axis=0)))  # the drive that it moves most
+        whole = float(np.mean(before[:, own] ** 2)) - 1.0
+        back = float(np.mean((after + added)[:, own] ** 2) - np.mean(after[:, own] ** 2))
         share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         values, numbers = hypothesis.values(deviation), {}
         for (name, p), s in zip(hypothesis.parameters.items(), std, strict=True):
             reach = _NORMAL95 * s * p.prior_std
             low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
             numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
+        if is_local(hypothesis):
+            for name, value in zip(("start", "duration"), hypothesis.interval, strict=True):
+                numbers[name] = Estimate(value, "s", value - fit.spacing, value + fit.spacing, 0.0)
         chance, others = chances[hypothesis.key]
         named.append(NamedEffect(*hypothesis.key, chance, numbers, others, share))
     return tuple(sorted(named, key=lambda e: (-round(e.probability, 3), -e.share)))
@@ -503,8 +564,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
     kind, _, place = name.partition(".")
     if kind in BODY_PARAMETERS:
         return BODY_PARAMETERS[kind]
-    chain = mechanism.setup.chain
-    force = "N" if place in chain.joints and chain.tree.is_slide[chain.index(place)] else "N m"
+    force = force_unit(mechanism.setup.chain, place)
     length = "m" if force == "N" else "rad"
     return {
         "viscous": f"{force} s/{length}", "viscous_asymmetry": f"{force} s/{length}",
