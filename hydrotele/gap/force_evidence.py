@@ -42,7 +42,7 @@ from hydrotele.gap.model_search import PARAMETER_SCALES
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
-MAX_SIGN_DOUBT = 0.25  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
+MAX_SIGN_DOUBT = 0.05  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
 _ORDER_SHARE = 1.0 / 3.0  # of that time, which the autoregression of the noise may span: it must not follow the motion
 _LEAST_NOISE = 0.01  # fraction of the variance of the errors that is noise at least
 _NOISE_ROUNDS = 3  # of estimating noise and coefficients in turn
@@ -523,31 +523,32 @@ class ForceEvidence(GapModel):
         """
         self.set_base(judged)
         lacking = np.flatnonzero(self.residual_gain(judged) > _LEAST_PULSE) if self._has_pulses else ()
-        left, best = self._left(judged), (0.0, 0.0, 0.0, 0, "", 0, 0)
-        for run, (a, b) in enumerate(zip(self.columns.starts[:-1], self.columns.starts[1:], strict=True)):
-            rows = slice(*self._edges[run : run + 2])
-            knots = np.unique(np.linspace(0, b - a, min(b - a, _INSTANTS), endpoint=False).astype(int))
-            for k in lacking:
-                steps = np.zeros((b - a, left.shape[1], len(knots)))
-                steps[:, k] = -self._pulse_size(k) * (np.arange(b - a)[:, None] >= knots)
-                series = self.shape.prewhiten(steps, self.columns.doubt[a:b], (0, b - a))
-                series = np.concatenate([series, left[rows, :, None]], axis=2)
-                for scale in scales:
-                    levels = _shrink_levels(self._levels, scale)
-                    whitened, spread = whiten_forces(
+        rest, losses = self._values @ self._sum_columns(judged.guess), []
+        best = 0.0, 0.0, 0.0, 0, "", 0, 0
+        for scale in scales if len(lacking) else ():
+            levels = _shrink_levels(self._levels, scale)
+            levels, value, cost = self._marginalise(rest, levels, [levels.parameter_scale])
+            left = rest - self._nuisance @ value
+            whitened, spread = self._filter_errors(left[:, :, None], levels)
+            losses.append(float(np.sum(whitened**2) + 2.0 * np.log(spread).sum()) + cost)
+            for run, (a, b) in enumerate(zip(self.columns.starts[:-1], self.columns.starts[1:], strict=True)):
+                rows = slice(*self._edges[run : run + 2])
+                knots = np.unique(np.linspace(0, b - a, min(b - a, _INSTANTS), endpoint=False).astype(int))
+                for k in lacking:
+                    steps = np.zeros((b - a, left.shape[1], len(knots)))
+                    steps[:, k] = -self._pulse_size(k) * (np.arange(b - a)[:, None] >= knots)
+                    series = self.shape.prewhiten(steps, self.columns.doubt[a:b], (0, b - a))
+                    series = np.concatenate([series, left[rows, :, None]], axis=2)
+                    flat = whiten_forces(
                         series, self._missing[rows], self._first[rows], self._fade, levels.noise, levels.sizes
-                    )
-                    flat = whitened.reshape(-1, len(knots) + 1)
+                    )[0].reshape(-1, len(knots) + 1)
                     square, right = flat[:, :-1].T @ flat[:, :-1], flat[:, :-1].T @ flat[:, -1]
                     width = np.diag(square)
                     precision = 1.0 + np.maximum(width[:, None] + width - 2.0 * square, 0.0)
                     pull = right[:, None] - right
                     factors = np.triu(pull**2 / precision - np.log(precision), 1)
                     first, last = np.unravel_index(int(np.argmax(factors)), factors.shape)
-                    loss = float(flat[:, -1] @ flat[:, -1] + 2.0 * np.log(spread).sum())
-                    if scale == scales[0]:
-                        given = loss
-                    gain = given - loss + float(factors[first, last]) - _choice_cost(len(knots))
+                    gain = losses[0] - losses[-1] + float(factors[first, last]) - _choice_cost(len(knots))
                     if gain > best[0]:
                         size = float(pull[first, last] / precision[first, last])
                         best = gain, size, scale, k, self.columns.runs[run], a + knots[first], a + knots[last]

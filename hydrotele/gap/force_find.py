@@ -75,6 +75,7 @@ from hydrotele.multibody.regressor import BODY_PARAMETERS
 MIN_FORCE_SHARE = 0.02
 """Fraction of the RMS force of a drive below which a residual force is no gap: models of friction are no better."""
 _MAX_ROUNDS = 4  # of taking sensor errors off the readings and searching again
+_CHANGING = ("coulomb_friction", "force_pulse")  # effects on which noise or form depend
 _UNCHANGED = 0.01  # prior standard deviations; a smaller change of the sensor errors ends these rounds
 _FORM = 0.1  # of a drive's dry friction, by which its form near rest may differ: presliding is not in the model
 _SHARPNESS = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
@@ -298,10 +299,12 @@ def uncertain_form(mechanism: Mechanism, columns: Columns, about: Mapping[str, f
 def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvidence, Found]:
     """Search; search again about the effects on which the columns depend, until nothing changes.
 
-    These are sensor errors, which are taken off the readings, and dry friction, whose form near rest is uncertain.
+    These are sensor errors, which are taken off the readings, dry friction, whose form near rest is uncertain, and
+    force pulses, which are no noise.
     """
     applied: dict[Key, np.ndarray] = {}
     sensors: Sequence[tuple[ForceEffect, np.ndarray]] = ()
+    pulses = np.zeros((0, 0))
     chain, joints, about = task.mechanism.setup.chain, task.mechanism.measured_joints, {}
     for turn in range(_MAX_ROUNDS):
         begin = 0.9 * turn / _MAX_ROUNDS
@@ -310,12 +313,14 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
         columns = undone(columns, {h.key: v for h, v in sensors}, {h.key: h.columns[0] for h, _ in sensors})
         effects = force_effects(chain, columns, task.nominal, applied)
         effects = [one for one in effects if not names or one.name in names]
-        evidence = _evidence(task, columns, about, not names or "force_pulse" in names)
+        without = replace(columns, measured=columns.measured - pulses) if columns.gap.shape == pulses.shape else columns
+        evidence = _evidence(task, columns, about, estimate_noise(without), not names or "force_pulse" in names)
         found = search_model(
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
         sensors = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
-        known = [*sensors, *(pair for pair in task.effects_of(found.guess) if pair[0].name == "coulomb_friction")]
+        known = [*sensors, *(pair for pair in task.effects_of(found.guess) if pair[0].name in _CHANGING)]
+        pulses = evidence.force_of(Guess(tuple(part for part in found.guess.parts if is_local(part[0]))))
         value = evidence.changes(found.judged)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
         steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
@@ -327,12 +332,10 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
 
 
 def _evidence(
-    task: _Task, columns: Columns, about: Mapping[str, float], has_pulses: bool = False
+    task: _Task, columns: Columns, about: Mapping[str, float], shape: NoiseShape, has_pulses: bool = False
 ) -> ForceEvidence:  # fmt: skip
     form, uncertain = uncertain_form(task.mechanism, columns, about), uncertain_parameters(task.mechanism, task.nominal)
-    return ForceEvidence(
-        columns, estimate_noise(columns), _root(columns, form), _root(columns, uncertain), has_pulses=has_pulses
-    )
+    return ForceEvidence(columns, shape, _root(columns, form), _root(columns, uncertain), has_pulses=has_pulses)
 
 
 def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
@@ -345,7 +348,8 @@ def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
 
 def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     """Evidence on the readings as they are, and a search that found nothing."""
-    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band), {})
+    columns = build_columns(task.fit, task.mechanism, task.band)
+    evidence = _evidence(task, columns, {}, estimate_noise(columns))
     judged = evidence.judge(Guess())
     return evidence, Found(judged, judged, None, (), (), (), (), None)
 
