@@ -42,7 +42,7 @@ from hydrotele.gap.model_search import PARAMETER_SCALES
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
-MAX_SIGN_DOUBT = 0.05  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
+MAX_SIGN_DOUBT = 0.1  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
 _ORDER_SHARE = 1.0 / 3.0  # of that time, which the autoregression of the noise may span: it must not follow the motion
 _LEAST_NOISE = 0.01  # fraction of the variance of the errors that is noise at least
 _NOISE_ROUNDS = 3  # of estimating noise and coefficients in turn
@@ -95,11 +95,11 @@ class NoiseShape(NamedTuple):
             parts.append(np.einsum("ij,njm->nim", self.white, own))
         return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
-    def missing_forces(self, rest: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-        """Return the RMS (k,) of errors (n, k) beyond the noise [N] or [N m]."""
+    def missing_forces(self, rest: np.ndarray, doubt: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the RMS (k,) of errors (n, k) beyond noise of a level (k,) [N] or [N m]."""
         weight = self.weights(doubt)
         square = np.sum((weight * rest) ** 2, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1.0)
-        return np.sqrt(np.maximum(square - self.std**2, 0.0))
+        return np.sqrt(np.maximum(square - (noise * self.std) ** 2, 0.0))
 
 
 def estimate_noise(columns: Columns) -> NoiseShape:
@@ -185,7 +185,7 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
 
 
 def _usual_fraction(new: np.ndarray, there: np.ndarray, starts: Sequence[int], length: int) -> np.ndarray:
-    """Variance (k,) of most windows of innovations (n, k), as a fraction of the variance of all; at most 1.
+    """Variance (k,) of most windows of innovations (n, k), as a fraction of the variance of all.
 
     A force that acts for a short time is no noise. Independent normal innovations have a fraction of 1.
     """
@@ -196,7 +196,7 @@ def _usual_fraction(new: np.ndarray, there: np.ndarray, starts: Sequence[int], l
     for k in range(new.shape[1]):
         level = squares[full[:, k], k] / counts[full[:, k], k]
         if level.size and level.mean() > 0.0:
-            out[k] = min(1.0, float(np.median(level) / level.mean()) * length / float(chi2.ppf(0.5, length)))
+            out[k] = float(np.median(level) / level.mean()) * length / float(chi2.ppf(0.5, length))
     return out
 
 
@@ -206,7 +206,7 @@ def _fast_covariance(
     """Autocovariance of the noise (order + 1, k, k) in weighted errors (n, k).
 
     The noise has no memory beyond `order` rows. At larger lags, the covariance is that of residual forces; its
-    extrapolation to small lags is subtracted. A triangular window ends the remainder.
+    extrapolation to small lags is subtracted. A parabolic window ends the remainder.
     """
     lags = np.arange(max(round(MEMORY / spacing), order + 2) + 1)
     fade, found = np.exp(-lags * spacing / MEMORY), []
@@ -222,7 +222,7 @@ def _fast_covariance(
     size, ways = np.linalg.eigh(0.5 * (part + part.T))
     slow = root @ (ways * np.clip(size, 0.0, 1.0 - _LEAST_NOISE)) @ ways.T @ root.T
     near = lags[: order + 1]
-    return (covariance[near] - fade[near, None, None] * slow) * (1.0 - near / (order + 1.0))[:, None, None]
+    return (covariance[near] - fade[near, None, None] * slow) * (1.0 - (near / (order + 1.0)) ** 2)[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -637,6 +637,11 @@ class ForceEvidence(GapModel):
         hidden = np.maximum(self._levels.parameter_scale**2 * self._prior_variance - np.sum(own**2, axis=1), 0.0)
         spread = np.sqrt(np.einsum("mr,rs,ms->m", own, covariance[count:, count:], own) + hidden)
         return self._unit * (self._mix[:, ~self._is_form] @ self._marginal_mean(judged)[~self._is_form]), spread
+
+    def judge_alike(self, guess: Guess, other: Judged) -> Judged:
+        """Re-estimate the noise levels of a set of effects with the scale of the uncertain parameters of another."""
+        self.set_base(other)
+        return self._judge(guess, (other.tracks[0].levels.parameter_scale,))
 
     def calibration_gain(self, judged: Judged) -> float:
         """Return twice the log evidence that the uncertain parameters bring against those of the given model."""

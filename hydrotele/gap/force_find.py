@@ -461,7 +461,8 @@ def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
     """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
-    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt)
+    noise = judged.tracks[0].levels.noise
+    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt, noise)
     return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
 
 
@@ -493,9 +494,8 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         table = effect_probabilities(found.judged, charge, rest, rivals)
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         own = int(np.argmax(np.sqrt(np.mean(force**2, axis=0)) / evidence.shape.std))
-        back = evidence.remaining_force(found.judged) + force
-        without = evidence.shape.missing_forces(back, evidence.columns.doubt)[own] ** 2
-        now = _missing_forces(evidence, found.judged)[own] ** 2
+        alike = evidence.judge_alike(rest.guess, found.judged)  # its uncertain parameters must not take the place
+        now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, alike))
         trust = believed_part(1.0 - now / without if without > now else 0.0)
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
