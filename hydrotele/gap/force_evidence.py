@@ -43,6 +43,7 @@ from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups,
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
 MAX_SIGN_DOUBT = 0.1  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
+NORMAL95 = 1.96  # half-width of a 95 % interval in standard deviations
 _ORDER_SHARE = 1.0 / 3.0  # of that time, which the autoregression of the noise may span: it must not follow the motion
 _LEAST_NOISE = 0.01  # fraction of the variance of the errors that is noise at least
 _NOISE_ROUNDS = 3  # of estimating noise and coefficients in turn
@@ -96,10 +97,15 @@ class NoiseShape(NamedTuple):
         return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
     def missing_forces(self, rest: np.ndarray, doubt: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the RMS (k,) of errors (n, k) beyond noise of a level (k,) [N] or [N m]."""
+        """Return the RMS (k,) of errors (n, k) beyond noise of a level (k,) [N] or [N m], 0 if not significant.
+
+        The variance of n normal errors has the standard error sqrt(2 / n) times itself.
+        """
         weight = self.weights(doubt)
         square = np.sum((weight * rest) ** 2, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1.0)
-        return np.sqrt(np.maximum(square - (noise * self.std) ** 2, 0.0))
+        own = (noise * self.std) ** 2
+        error = own * np.sqrt(2.0 / np.maximum(np.sum(weight > 0.0, axis=0), 1))
+        return np.sqrt(np.where(square - own > NORMAL95 * error, square - own, 0.0))
 
 
 def estimate_noise(columns: Columns) -> NoiseShape:

@@ -26,7 +26,7 @@ from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
 from hydrotele.gap.find import Progress, verdict_of, without_details
 from hydrotele.gap.force_columns import ForceEffect, force_effects
-from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, estimate_noise
+from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
     TYPICAL,
@@ -82,7 +82,6 @@ _SHARPNESS = 0.5  # of the way from the expected sign of an uncertain rate to th
 _WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
 _MIN_PROBABILITY = 0.005  # below which an alternative is not listed
 _DISTINCT = 3.0  # standard deviations from which a calibrated parameter is listed
-_NORMAL95 = 1.96
 _REJECTED = (
     "The changes found on the fitted runs increase the errors on the held-out run; they were"
     " rejected, and no effect is named."
@@ -541,7 +540,7 @@ def _describe_effects(
         share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         values, numbers = hypothesis.values(deviation), {}
         for (name, p), s in zip(hypothesis.parameters.items(), std, strict=True):
-            reach = _NORMAL95 * s * p.prior_std
+            reach = NORMAL95 * s * p.prior_std
             low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
             numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
         if is_local(hypothesis):
@@ -556,7 +555,7 @@ def _calibration(task: _Task, result: _Result) -> dict[str, Estimate]:
     """Calibrated parameters that differ from the MJCF."""
     told = {}
     for name, (change, s) in result.calibration.items():
-        value, reach = task.nominal[name] + change, _NORMAL95 * s
+        value, reach = task.nominal[name] + change, NORMAL95 * s
         if abs(change) > _DISTINCT * s:
             unit = parameter_unit(task.mechanism, name)
             told[name] = Estimate(value, unit, value - reach, value + reach, task.nominal[name])
