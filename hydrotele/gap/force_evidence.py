@@ -432,6 +432,14 @@ class ForceEvidence(GapModel):
         found: Any = tuple(tracks)
         return Judged(guess, found, sum(t.loss for t in tracks) + levels.penalty + guess.prior)
 
+    def judge_from(self, guess: Guess, judged: Judged) -> Judged:
+        """Re-estimate the levels of a set of effects from those of another model."""
+        own, self._levels = self._levels, judged.tracks[0].levels
+        try:
+            return self.judge(guess)
+        finally:
+            self._levels = own
+
     def _most_likely(self, left: np.ndarray, levels: ForceLevels) -> ForceLevels:
         """Levels of the noise and of the residual forces, channel by channel, by maximum posterior density."""
         noise, sizes, penalty = levels.noise.copy(), levels.sizes.copy(), 0.0

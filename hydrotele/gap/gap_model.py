@@ -107,6 +107,10 @@ class GapModel(Protocol):
         """
         ...
 
+    def judge_from(self, guess: Guess, judged: Judged) -> Judged:
+        """Re-estimate the noise levels of a set of effects, starting from those of another model."""
+        ...
+
     def set_base(self, judged: Judged) -> Judged:
         """Whiten the errors of later guesses with the gains of this one; return it."""
         ...

@@ -67,8 +67,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         other.set_base(held.judged)
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if is_pulse(c)]
-        rounds, _ = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
-        last = rounds[-1].after if rounds else held
+        _, _, last = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
         if not last.fit:  # nothing, or coloured noise
             return HeldOut(found, spread, ())
         sizes, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []

@@ -56,6 +56,10 @@ class MachineModel(GapModel):
         """Re-estimate the noise levels of a set of effects."""
         return self.evidence.judged(guess, same, reopened)
 
+    def judge_from(self, guess: Guess, judged: Judged) -> Judged:
+        """Re-estimate the noise levels of a set of effects from those of another model."""
+        return self.evidence.judged_from(guess, judged.tracks[0].levels)
+
     def set_base(self, judged: Judged) -> Judged:
         """Set the base of later errors."""
         return self.evidence.set_base(judged)

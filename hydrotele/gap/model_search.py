@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hydrotele.estimate.evidence import Fit, Judged, occam_penalty
+from hydrotele.estimate.evidence import Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.dictionary import list_versions
@@ -163,8 +163,8 @@ def search_model(
     given = Model(settle_noise(model, model.judge(Guess())))
     model.keep(given.judged)
     candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
-    rounds, first = add_effects(model, given, candidates, has_laws, tell)
-    now = rounds[-1].after if rounds else given
+    rounds, first, now = add_effects(model, given, candidates, has_laws, tell)
+    given = rounds[0].before if rounds else now
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
     tell("remove unnecessary effects", 0.87)
@@ -188,7 +188,7 @@ def search_model(
 
 def add_effects(
     model: GapModel, now: Model, candidates: Sequence[Hypothesis], has_laws: bool, tell: Progress
-) -> tuple[list[Round], tuple[Proposal, ...]]:
+) -> tuple[list[Round], tuple[Proposal, ...], Model]:
     """Add effects, laws, the calibration, coloured noise and differences between runs as long as each brings enough.
 
     Args:
@@ -199,7 +199,7 @@ def add_effects(
         tell: called with (what is done, fraction done).
 
     Returns:
-        The rounds, and the proposals of the first one.
+        The rounds, the proposals of the first one, and the last model, which is the base.
     """
     quantities, effects = model.list_quantities(candidates), list(dict.fromkeys(c.name for c in candidates))
     first = tuple[Proposal, ...]()
@@ -218,13 +218,34 @@ def add_effects(
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
+        if better.charged_score < now.charged_score:
+            now = renew_noise(model, now, better)
         if not better.charged_score < now.charged_score:
             break
         settled = settle(model, better)
         rounds.append(Round(now, settled, tuple(m for m in models if m is not better)))
         now = settled
         model.keep(now.judged)
-    return rounds, first
+    return rounds, first, now
+
+
+def renew_noise(model: GapModel, now: Model, better: Model) -> Model:
+    """Estimate the noise levels of a model from those of a better one, too, and return it with the likelier ones.
+
+    The likelihood of the noise levels may have several maxima. Without this, an effect of size zero wins if only its
+    noise levels reached the higher maximum.
+
+    Args:
+        model: whose base is `now`; the returned model is the base afterwards.
+        now: the model.
+        better: an extension of it.
+    """
+    if better.colours != now.colours:
+        return now
+    again = Model(model.judge_from(now.guess, better.judged), now.fit, now.penalty)
+    if not again.score < now.score - _SETTLED:
+        return now
+    return Model(settle_noise(model, again.judged), now.fit, now.penalty)
 
 
 def settle_noise(model: GapModel, judged: Judged) -> Judged:
@@ -439,7 +460,31 @@ def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
         group = model.uncertain_parameters(guess, proposal.parameter_scale)
         guess = guess.plus(group, np.zeros(group.size)) if group.size else guess
     found = model.refine(now.judged, Guess((*guess.parts, *proposal.parts)), proposal.residual_scale, dense)
-    return Model(found[0], found[1], found[1].whole_penalty) if found else None
+    if (
+        found is None
+        or linear_factor(found[1], range(len(now.guess.parts), len(found[1].guess.parts))) < MIN_LOG_BAYES_FACTOR
+    ):
+        return None
+    return Model(found[0], found[1], found[1].whole_penalty)
+
+
+def linear_factor(fit: Fit, chosen: Collection[int]) -> float:
+    """Return twice the log Bayes factor of some parts of a fit by the errors alone, with kept noise levels.
+
+    A parameter that only makes the predicted errors smaller, such as a leakage that damps their growth, lowers the
+    objective without explaining a reading. Here it counts nothing.
+
+    Args:
+        fit: linearised about its parameters; the posterior is normal.
+        chosen: indices of the parts.
+    """
+    part_of = np.repeat(np.arange(len(fit.guess.parts)), [h.size for h in fit.guess.hypotheses])
+    own = np.isin(part_of, list(chosen))
+    order = np.concatenate([np.flatnonzero(~own), np.flatnonzero(own)])
+    deviation = fit.guess.deviation[own]
+    precision = np.linalg.inv(invert_information(fit.information)[np.ix_(own, own)])
+    penalty = occam_penalty(fit.information[np.ix_(order, order)], len(deviation))
+    return float(deviation @ precision @ deviation) - penalty
 
 
 def colour_noise(model: GapModel, now: Model) -> list[Model]:
@@ -482,6 +527,8 @@ def remove_needless(
     while True:
         rests = [without_part(model, given, now, k, rounds) for k in range(len(now.guess.parts))]
         costs = [rest.score - now.score for rest in rests]
+        if now.fit:
+            costs = [min(cost, linear_factor(now.fit, [k])) for k, cost in enumerate(costs)]
         if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
             return now, rests
         now = rests[int(np.argmin(costs))]

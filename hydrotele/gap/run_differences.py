@@ -99,7 +99,8 @@ def between_runs(quantity: Quantity, runs: Sequence[str], scale: float) -> Hypot
     """
     p = quantity.parameter
     own = Parameter(
-        p.unit, 0.0, p.lower_bound - p.nominal, p.upper_bound - p.nominal, scale * p.prior_std, 0.0,
+        p.unit, 0.0, p.lower_bound - p.nominal, p.upper_bound - p.nominal, scale * p.prior_std,
+        p.min_relevant_change,
     )  # fmt: skip
 
     def change(machine: Machine, values: Mapping[str, float]) -> Machine:

@@ -8,18 +8,20 @@ import pytest
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import all_axes
 from hydrotele.estimate.colour import Colour
-from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.evidence import Evidence, Fit
+from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
 from hydrotele.estimate.track import STEP
 from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.machine_model import scale_residual_inputs
+from hydrotele.gap.model_search import linear_factor
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.term import Term
+from tests.gap.test_regression import _log_density
 from tests.measured import MEASURED
 from tests.small_machines import add_coloured_noise, simulate_data
 
@@ -51,6 +53,25 @@ def test_the_answer_adds_up_and_names_the_deepest_sure_level():
     assert answer.families("boom") == {"friction": pytest.approx(0.98), "leakage": pytest.approx(0.01)}
     assert answer.level == ("boom", "friction")
     assert sum(answer.places().values()) + answer.none == pytest.approx(1.0)
+
+
+def test_the_factor_of_a_part_is_that_of_the_dense_gaussian():
+    rng = np.random.default_rng(5)
+    errors, sizes = 3.0 * rng.normal(size=40), (2, 1, 2)
+    columns = [rng.normal(size=(40, size)) for size in sizes]
+    every = np.hstack(columns)
+    information = every.T @ every + np.eye(5)
+    deviation = np.split(np.linalg.solve(information, every.T @ errors), np.cumsum(sizes)[:-1])
+    table = {"a": Parameter("1", 0.0, -9.0, 9.0, 1.0, 0.0), "b": Parameter("1", 0.0, -9.0, 9.0, 1.0, 0.0)}
+    parts = [
+        (Hypothesis(f"part_{k}", "slide", dict(list(table.items())[:size])), d)
+        for k, (size, d) in enumerate(zip(sizes, deviation, strict=True))
+    ]
+    fit = Fit(Guess(tuple(parts)), 0.0, 0.0, 0.0, information)
+    for chosen in ([0], [1], [0, 2]):
+        rest = [columns[k] for k in range(3) if k not in chosen]
+        expected = 2.0 * (_log_density(errors, *columns) - _log_density(errors, *rest))
+        assert linear_factor(fit, chosen) == pytest.approx(expected, abs=1e-9)  # rounding of a 40 x 40 determinant
 
 
 def _set_ripple(machine, location, values):
