@@ -40,6 +40,7 @@ from hydrotele.gap.laws import LawForm
 from hydrotele.gap.mechanism_columns import LEAST, TYPICAL, Columns, strengths
 from hydrotele.gap.model_search import PARAMETER_SCALES
 from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
+from hydrotele.identify.equations import design_low_pass
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
 MAX_SIGN_DOUBT = 0.1  # doubt of the sign of dry friction, beyond which a drive counts as sticking: any force may act
@@ -55,7 +56,8 @@ _RESIDUAL_WIDTH = 4.0  # of the log of a residual force's size, in units of the 
 _LOG_SIZES = (-6.0, 9.0)  # between which that log is looked for
 _STEPS = 6  # Gauss-Newton steps
 _SETTLED = 1.0  # twice the log likelihood; a smaller change ends the alternation of fits and noise levels
-_INSTANTS = 300  # of a run at which a pulse may start or end
+_INSTANTS, _FINE = 300, 9  # of a run at which a pulse may start or end; within a row about the best of them
+_CHOICE_OF_INTERVAL = 2.0 * float(np.log(0.5 * _INSTANTS * (_INSTANTS - 1)))  # all are equally probable
 _LEAST_PULSE = 20.0  # twice the log likelihood that a residual force must bring where a pulse is looked for
 _MAX_PULSE = 20.0  # typical sizes
 _LEVEL_ROUNDS = 2  # of estimating the marginalised parameters and the noise levels in turn
@@ -537,52 +539,67 @@ class ForceEvidence(GapModel):
         """
         self.set_base(judged)
         lacking = np.flatnonzero(self.residual_gain(judged) > _LEAST_PULSE) if self._has_pulses else ()
-        rest, losses = self._values @ self._sum_columns(judged.guess), []
-        best = 0.0, 0.0, 0.0, 0, "", 0, 0
+        columns, rest = self.columns, self._values @ self._sum_columns(judged.guess)
+        losses, found = [], []
         for scale in scales if len(lacking) else ():
             levels = _shrink_levels(self._levels, scale)
             levels, value, cost = self._marginalise(rest, levels, [levels.parameter_scale])
             left = rest - self._nuisance @ value
             whitened, spread = self._filter_errors(left[:, :, None], levels)
             losses.append(float(np.sum(whitened**2) + 2.0 * np.log(spread).sum()) + cost)
-            for run, (a, b) in enumerate(zip(self.columns.starts[:-1], self.columns.starts[1:], strict=True)):
-                rows = slice(*self._edges[run : run + 2])
-                knots = np.unique(np.linspace(0, b - a, min(b - a, _INSTANTS), endpoint=False).astype(int))
-                for k in lacking:
-                    steps = np.zeros((b - a, left.shape[1], len(knots)))
-                    steps[:, k] = -self._pulse_size(k) * (np.arange(b - a)[:, None] >= knots)
-                    series = self.shape.prewhiten(steps, self.columns.doubt[a:b], (0, b - a))
-                    series = np.concatenate([series, left[rows, :, None]], axis=2)
-                    flat = whiten_forces(
-                        series, self._missing[rows], self._first[rows], self._fade, levels.noise, levels.sizes
-                    )[0].reshape(-1, len(knots) + 1)
-                    square, right = flat[:, :-1].T @ flat[:, :-1], flat[:, :-1].T @ flat[:, -1]
-                    width = np.diag(square)
-                    precision = 1.0 + np.maximum(width[:, None] + width - 2.0 * square, 0.0)
-                    pull = right[:, None] - right
-                    factors = np.triu(pull**2 / precision - np.log(precision), 1)
-                    first, last = np.unravel_index(int(np.argmax(factors)), factors.shape)
-                    gain = losses[0] - losses[-1] + float(factors[first, last]) - _choice_cost(len(knots))
-                    if gain > best[0]:
-                        size = float(pull[first, last] / precision[first, last])
-                        best = gain, size, scale, k, self.columns.runs[run], a + knots[first], a + knots[last]
-        if not best[4]:
+            for run, (a, b) in enumerate(zip(columns.starts[:-1], columns.starts[1:], strict=True)):
+                times = columns.time[np.unique(np.linspace(a, b - 1, min(b - a, _INSTANTS)).astype(int))]
+                for k in map(int, lacking):
+                    factor, *_, start, end = self._best_interval(run, k, times, levels, left)
+                    fine = np.linspace(-columns.spacing, columns.spacing, _FINE)
+                    near = np.concatenate([start + fine, end + fine])
+                    factor, size, start, end = self._best_interval(run, k, near, levels, left)
+                    gain = losses[0] - losses[-1] + factor - _CHOICE_OF_INTERVAL
+                    found.append((gain, scale, run, k, start, end, size))
+        gain, scale, run, k, start, end, size = max(found, default=(0.0,) * 7)
+        if not gain > 0.0:
             return []
-        gain, size, scale, drive, name, first, last = best
-        return [((self._pulse(judged.guess, drive, name, first, last), np.array([size])), gain, scale)]
+        return [((self._pulse(judged.guess, int(run), int(k), start, end), np.array([size])), gain, scale)]
+
+    def _best_interval(
+        self, run: int, drive: int, times: np.ndarray, levels: ForceLevels, left: np.ndarray
+    ) -> tuple[float, float, float, float]:
+        """Return the largest of twice the log Bayes factors of pulses between some times, its size, start and end."""
+        (a, b), rows = self.columns.starts[run : run + 2], slice(*self._edges[run : run + 2])
+        steps = np.zeros((b - a, left.shape[1], len(times)))
+        steps[:, drive] = -self._pulse_size(drive) * self._steps(slice(a, b), times)
+        series = self.shape.prewhiten(steps, self.columns.doubt[a:b], (0, b - a))
+        series = np.concatenate([series, left[rows, :, None]], axis=2)
+        flat = whiten_forces(
+            series, self._missing[rows], self._first[rows], self._fade, levels.noise, levels.sizes
+        )[0].reshape(-1, len(times) + 1)  # fmt: skip
+        square, right = flat[:, :-1].T @ flat[:, :-1], flat[:, :-1].T @ flat[:, -1]
+        width = np.diag(square)
+        precision = 1.0 + np.maximum(width[:, None] + width - 2.0 * square, 0.0)
+        pull = right[:, None] - right
+        factors = np.where(times[:, None] < times, pull**2 / precision - np.log(precision), -np.inf)
+        first, last = np.unravel_index(int(np.argmax(factors)), factors.shape)
+        size = float(pull[first, last] / precision[first, last])
+        return float(factors[first, last]), size, float(times[first]), float(times[last])
+
+    def _steps(self, rows: slice, times: np.ndarray) -> np.ndarray:
+        """(n, s) unit steps at some times, low-passed as the forces are."""
+        low, _ = design_low_pass(self.columns.band, self.columns.row)
+        edge = self.columns.row * (np.arange(len(low)) - 0.5 * (len(low) - 1))
+        return np.interp(self.columns.time[rows, None] - times, edge, np.cumsum(low) / np.sum(low), 0.0, 1.0)
 
     def _pulse_size(self, drive: int) -> float:
         """Typical size of a force pulse [N] or [N m]."""
         return TYPICAL * float(np.sqrt(np.mean(self.columns.measured[:, drive] ** 2)))
 
-    def _pulse(self, guess: Guess, drive: int, run: str, first: int, last: int) -> ForceEffect:
-        """Force pulse on a drive from one row to another; its column becomes one of those of the runs."""
-        columns, name = self.columns, self.columns.drives[drive]
-        column = f"pulse.{name}.{first}.{last}"
+    def _pulse(self, guess: Guess, run: int, drive: int, start: float, end: float) -> ForceEffect:
+        """Force pulse on a drive in one run; its column becomes one of those of the runs."""
+        columns, size = self.columns, self._pulse_size(drive)
+        place = f"{columns.drives[drive]}.{columns.runs[run]}"
+        column = f"pulse.{place}.{start!r}.{end!r}"
         if column not in self._place:
-            force = np.zeros((*columns.gap.shape, 1))
-            force[first:last, drive] = -1.0  # the drive needs less
-            size = self._pulse_size(drive)
+            rows, force = slice(*columns.starts[run : run + 2]), np.zeros((*columns.gap.shape, 1))
+            force[rows, drive] = np.diff(self._steps(rows, np.array([start, end])), axis=1)  # the drive needs less
             white = self.shape.prewhiten(size * force, columns.doubt, columns.starts)
             self._place[column] = len(columns.names)
             self.columns = replace(
@@ -594,17 +611,12 @@ class ForceEvidence(GapModel):
             self._prior_variance = np.append(self._prior_variance, 0.0)
             self._roots.clear()
             self._root, _ = self._root_of(self._levels)
-        place = f"{name}.{run}"
         before = sum(h.location.startswith(place) for h in guess.hypotheses)
-        kind = columns.units[drive]
-        size, start = self._pulse_size(drive), float(columns.time[first])
-        least = LEAST / TYPICAL * size
-        bound = _MAX_PULSE * size
+        bound, least = _MAX_PULSE * size, LEAST / TYPICAL * size
         return ForceEffect(
             "force_pulse", f"{place}.{before + 1}" if before else place,
-            {"size": Parameter(kind, 0.0, -bound, bound, size, least)}, None, (column,),
-            interval=(start, float(columns.time[last - 1]) + columns.spacing - start),
-            choice_cost=_choice_cost(min(int(np.sum(np.diff(columns.starts))), _INSTANTS)),
+            {"size": Parameter(columns.units[drive], 0.0, -bound, bound, size, least)}, None, (column,),
+            interval=(start, end - start), choice_cost=_CHOICE_OF_INTERVAL,
         )  # fmt: skip
 
     def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:
@@ -743,11 +755,6 @@ class ForceLinearisation:
             groups = [np.hstack([groups[g] for g in joined])]
         errors = root @ self.along
         return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
-
-
-def _choice_cost(count: int) -> float:
-    """-2 log probability of one of the intervals between some instants, which are equally probable."""
-    return 2.0 * float(np.log(0.5 * count * (count - 1)))
 
 
 def _shrink_levels(levels: ForceLevels, ratio: float) -> ForceLevels:
