@@ -213,7 +213,8 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
         np.savetxt(tmp_path / "logs" / f"{name}.csv", rows, delimiter=",", header="time,angle.j,torque.j", comments="")
     gap = found_gap(tmp_path, "regression")
     named = {(e.name, e.location): e.parameters for e in gap.effects}
-    assert gap.verdict == "named" and set(named) == {("coulomb_friction", "j")}
+    assert set(named) == {("coulomb_friction", "j")}
+    assert gap.verdict == "named" or stribeck and gap.verdict == "partly"  # no effect of the library falls with the rate
     dry = named["coulomb_friction", "j"]["coulomb"].value
     assert abs(dry - 1.0) < (0.05 if stribeck else 0.01)  # Stribeck's effect hides in friction that falls with the rate
 
