@@ -36,11 +36,13 @@ class ForceEffect(Hypothesis):
         columns: those that it acts through.
         coefficients: (p,) parameter values -> (c,) what they add to the given model along the columns.
         variant: number of the form, where there are several.
+        interval: start and duration of a pulse [s].
     """
 
     columns: tuple[str, ...] = ()
     coefficients: Callable[[np.ndarray], np.ndarray] = lambda values: values
     variant: int = 0
+    interval: tuple[float, float] | None = None
 
 
 def force_effects(

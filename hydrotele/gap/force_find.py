@@ -19,15 +19,14 @@ from threadpoolctl import threadpool_limits
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.mjcf import read_mjcf
-from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Judged
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess
+from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
 from hydrotele.gap.find import Progress, verdict_of, without_details
 from hydrotele.gap.force_columns import ForceEffect, force_effects
-from hydrotele.gap.force_evidence import QUANTILES, ForceEvidence, NoiseShape, calibration_of, estimate_noise
+from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
     SENTENCES,
     TYPICAL,
@@ -35,6 +34,7 @@ from hydrotele.gap.mechanism_columns import (
     Key,
     build_columns,
     common_band,
+    force_unit,
     undone,
 )
 from hydrotele.gap.mechanism_find import MechanismModel, nominal_parameters
@@ -61,24 +61,27 @@ from hydrotele.gap.result import (
     NamedEffect,
     Prediction,
     Rejection,
+    RunDifference,
     VerdictExplanation,
 )
 from hydrotele.gap.rivals import effect_probabilities
+from hydrotele.gap.run_differences import difference_words
 from hydrotele.gap.search import Found
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
+from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.regressor import BODY_PARAMETERS
 
 MIN_FORCE_SHARE = 0.02
 """Fraction of the RMS force of a drive below which a residual force is no gap: models of friction are no better."""
 _MAX_ROUNDS = 4  # of taking sensor errors off the readings and searching again
+_CHANGING = ("coulomb_friction", "force_pulse")  # effects on which noise or form depend
 _UNCHANGED = 0.01  # prior standard deviations; a smaller change of the sensor errors ends these rounds
 _FORM = 0.1  # of a drive's dry friction, by which its form near rest may differ: presliding is not in the model
 _SHARPNESS = 0.5  # of the way from the expected sign of an uncertain rate to the sign of a calm one
 _WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
 _MIN_PROBABILITY = 0.005  # below which an alternative is not listed
 _DISTINCT = 3.0  # standard deviations from which a calibrated parameter is listed
-_NORMAL95 = 1.96
 _REJECTED = (
     "The changes found on the fitted runs increase the errors on the held-out run; they were"
     " rejected, and no effect is named."
@@ -107,13 +110,12 @@ class _Task(NamedTuple):
         return tuple(self.mechanism.setup.chain.drives)
 
     def unit(self, joint: str) -> str:
-        chain = self.mechanism.setup.chain
-        return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
+        return force_unit(self.mechanism.setup.chain, joint)
 
     def effects_of(self, guess: Guess) -> list[tuple[ForceEffect, np.ndarray]]:
-        """Accepted effects with their parameter values, without the calibration."""
+        """Accepted effects with their parameter values."""
         return [(h, np.array(list(h.values(d).values()))) for h, d in guess.parts
-                if h.name != CALIBRATION and isinstance(h, ForceEffect)]  # fmt: skip
+                if isinstance(h, ForceEffect)]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -121,19 +123,24 @@ class _Result:
     """A model, fitted, and what the held-out run says of it.
 
     Attributes:
-        guess: the model.
-        judged: on the fitted runs.
+        judged: the model on the fitted runs.
+        calibration: uncertain parameter -> its change and standard deviation, if they bring evidence.
         patched: the MJCF with it.
         then: held-out columns of the given model.
         now: of the patched one.
         sizes: (2, k) residual forces of the fitted runs and of the held-out run [N] or [N m]; 0 where no evidence.
+        heldout: the held-out run with the patched model as the given one.
+        differences: what the held-out run has in addition.
     """
 
     judged: Judged
+    calibration: Mapping[str, tuple[float, float]]
     patched: MechanismModel
     then: Columns
     now: Columns
     sizes: np.ndarray
+    heldout: ForceEvidence
+    differences: tuple[RunDifference, ...] = ()
 
     def share(self) -> np.ndarray:
         """(2, k) residual forces over the RMS of the drives' forces."""
@@ -206,6 +213,7 @@ def find_force_gap(
             break
         judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in more})
         result = _evaluate(task, evidence, judged, then)
+    result = _compare_heldout(result, mechanism.setup.chain, nominal)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
     lacks = _lacks(task, result)
@@ -223,6 +231,7 @@ def find_force_gap(
     of_fit, of_heldout = result.is_lacking
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
              for k, drive in enumerate(task.drives) if of_heldout[k] and not of_fit[k]]  # fmt: skip
+    more += [difference_words(d) for d in result.differences]
     more += [words for effect in named if (words := answer_words(effect))]
     tell("done", 1.0)
     return Gap(
@@ -234,9 +243,9 @@ def find_force_gap(
             for drive, a, b, std in zip(task.drives, *rms, shape.std, strict=True)
         }},
         law_units={"force": task.unit(task.drives[0])}, tests=_tests(result),
-        calibration=_calibration(task, evidence, result.judged), lacks=lacks,
+        calibration=_calibration(task, result), lacks=lacks,
         noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
-        notes=(*notes, *untrue, *more), answers=tuple(answer_document(named)),
+        notes=(*notes, *untrue, *more), differences=result.differences, answers=tuple(answer_document(named)),
         explanation=VerdictExplanation(
             compare_contenders(found, named), _rejections(found, named, details, untrue),
             _traces(task, evidence, result),
@@ -245,15 +254,16 @@ def find_force_gap(
     )  # fmt: skip
 
 
-def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> ForceEffect:
-    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping, as one group.
+def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> dict[str, float]:
+    """Return the parameters of the MJCF that are uncertain, by the relative uncertainty of the mapping.
 
     Args:
         mechanism: the model.
         nominal: of `nominal_parameters`.
 
     Returns:
-        The group. Moments and products of inertia are uncertain relative to the body's mass and size.
+        Parameter -> standard deviation. Moments and products of inertia are uncertain relative to the body's mass and
+        size.
     """
     off, chain, std = mechanism.mapping.relative_uncertainty, mechanism.setup.chain, {}
     for body, ten in zip(chain.bodies, chain.inertia, strict=True):
@@ -261,22 +271,24 @@ def uncertain_parameters(mechanism: Mechanism, nominal: Mapping[str, float]) -> 
         reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))
         for kind in BODY_PARAMETERS:
             std[f"{kind}.{body}"] = mass if kind == "mass" else reach if kind.startswith("moment") else spread
-    table = {}
-    for name, value in nominal.items():
-        width = off * std.get(name, abs(value))
-        if width > 0.0:
-            table[name] = Parameter(parameter_unit(mechanism, name), value, -np.inf, np.inf, width, 0.0)
-    return calibration_of(table)
+    sizes = {name: off * std.get(name, abs(value)) for name, value in nominal.items()}
+    return {name: size for name, size in sizes.items() if size > 0.0}
 
 
-def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
+def uncertain_form(mechanism: Mechanism, columns: Columns, about: Mapping[str, float]) -> dict[str, float]:
     """Return what no model knows: column -> standard deviation.
 
-    How dry friction acts near rest, and how sharply it turns.
+    How dry friction acts near rest, how sharply it turns, and where between two rows forces and positions were read.
+
+    Args:
+        mechanism: the given model.
+        columns: of the runs.
+        about: parameter -> how much it differs from the given one, as far as is known.
     """
-    form: dict[str, float] = {}
+    form = {"delay.force": 0.5 * columns.row}
     for one in mechanism.setup.friction_terms:
-        dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
+        found = about.get(f"coulomb.{one.location}", 0.0)
+        dry = abs(one.nominal.get("coulomb", 0.0) + found) + abs(one.nominal.get("stribeck", 0.0))
         if one.location in columns.drives and dry > 0.0:
             form |= {f"stribeck{number}.{one.location}": _FORM * dry for number in (0, 2)}
             form[f"sharpness.{one.location}"] = _SHARPNESS * dry
@@ -284,23 +296,31 @@ def uncertain_form(mechanism: Mechanism, columns: Columns) -> dict[str, float]:
 
 
 def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvidence, Found]:
-    """Search; take sensor errors off the readings and search again until nothing changes."""
+    """Search; search again about the effects on which the columns depend, until nothing changes.
+
+    These are sensor errors, which are taken off the readings, dry friction, whose form near rest is uncertain, and
+    force pulses, which are no noise.
+    """
     applied: dict[Key, np.ndarray] = {}
-    known: Sequence[tuple[ForceEffect, np.ndarray]] = ()
+    sensors: Sequence[tuple[ForceEffect, np.ndarray]] = ()
+    pulses = np.zeros((0, 0))
     chain, joints, about = task.mechanism.setup.chain, task.mechanism.measured_joints, {}
     for turn in range(_MAX_ROUNDS):
         begin = 0.9 * turn / _MAX_ROUNDS
         tell(f"compute the regressors of all effects, round {turn + 1}", begin)
-        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(known, chain, joints), about)
-        columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
+        columns = build_columns(task.fit, task.mechanism, task.band, sensor_errors(sensors, chain, joints), about)
+        columns = undone(columns, {h.key: v for h, v in sensors}, {h.key: h.columns[0] for h, _ in sensors})
         effects = force_effects(chain, columns, task.nominal, applied)
         effects = [one for one in effects if not names or one.name in names]
-        evidence = _evidence(task, columns)
+        without = replace(columns, measured=columns.measured - pulses) if columns.gap.shape == pulses.shape else columns
+        evidence = _evidence(task, columns, about, estimate_noise(without), not names or "force_pulse" in names)
         found = search_model(
             evidence, effects, lambda text, share, begin=begin: tell(text, begin + 0.9 * share / _MAX_ROUNDS)
         )
-        known = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
-        value = evidence.coefficients(found.guess)
+        sensors = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
+        known = [*sensors, *(pair for pair in task.effects_of(found.guess) if pair[0].name in _CHANGING)]
+        pulses = evidence.force_of(Guess(tuple(part for part in found.guess.parts if is_local(part[0]))))
+        value = evidence.changes(found.judged)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
         steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
                  / [p.prior_std for p in h.parameters.values()] for h, v in known]  # fmt: skip
@@ -310,18 +330,32 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
     return evidence, found
 
 
-def _evidence(task: _Task, columns: Columns, shape: NoiseShape | None = None) -> ForceEvidence:
-    return ForceEvidence(
-        columns, shape or estimate_noise(columns), uncertain_parameters(task.mechanism, task.nominal),
-        uncertain_form(task.mechanism, columns),
-    )  # fmt: skip
+def _evidence(
+    task: _Task, columns: Columns, about: Mapping[str, float], shape: NoiseShape, has_pulses: bool = False
+) -> ForceEvidence:  # fmt: skip
+    form, uncertain = uncertain_form(task.mechanism, columns, about), uncertain_parameters(task.mechanism, task.nominal)
+    return ForceEvidence(columns, shape, _root(columns, form), _root(columns, uncertain), has_pulses=has_pulses)
+
+
+def _root(columns: Columns, stds: Mapping[str, float]) -> np.ndarray:
+    """(m, r) root of the covariance of independent coefficients of some columns, column -> standard deviation."""
+    out = np.zeros((len(columns.names), len(stds)))
+    for k, (name, std) in enumerate(stds.items()):
+        out[columns.names.index(name), k] = std
+    return out
 
 
 def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     """Evidence on the readings as they are, and a search that found nothing."""
-    evidence = _evidence(task, build_columns(task.fit, task.mechanism, task.band))
+    columns = build_columns(task.fit, task.mechanism, task.band)
+    evidence = _evidence(task, columns, {}, estimate_noise(columns))
     judged = evidence.judge(Guess())
     return evidence, Found(judged, judged, None, (), (), (), (), None)
+
+
+def is_local(hypothesis: Hypothesis) -> bool:
+    """Return whether an effect acts in one run only, for a limited time."""
+    return isinstance(hypothesis, ForceEffect) and hypothesis.interval is not None
 
 
 def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
@@ -357,7 +391,7 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
     last = columns.time.max()
     for hypothesis, deviation in judged.guess.parts:
-        if hypothesis.name == CALIBRATION or hypothesis.size > 1:
+        if hypothesis.size > 1 or is_local(hypothesis):
             continue
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
@@ -378,11 +412,12 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
     """Patch the MJCF with a model and evaluate it on the held-out run."""
     mechanism, columns = task.mechanism, evidence.columns
     patched, now = task.given, then
-    if judged.guess.parts:
-        numbers = {
-            name: h.values(d)[name] - p.nominal for h, d in judged.guess.parts if h.name == CALIBRATION
-            for name, p in h.parameters.items()
-        }  # fmt: skip
+    calibration = {}
+    if evidence.calibration_gain(judged) > MIN_LOG_BAYES_FACTOR:
+        numbers = dict(zip(columns.names, zip(*evidence.calibration(judged), strict=True), strict=True))
+        calibration = {name: numbers[name] for name in uncertain_parameters(mechanism, task.nominal)}
+    if judged.guess.parts or calibration:
+        numbers = {name: change for name, (change, _) in calibration.items()}
         speeds = {joint: size[2] for joint, size in columns.sizes.items()}
         patch = patch_of(
             task.effects_of(judged.guess), mechanism.setup.chain, mechanism.measured_joints, numbers, task.nominal,
@@ -395,17 +430,38 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
             write_mechanism(Path(folder), patched.mjcf, patched.mapping)
             better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
         now = build_columns([task.heldout], better, task.band, patch.errors)
-    heldout = _evidence(task, now, evidence.shape)
-    sizes = []
-    for one, own in ((evidence, judged), (heldout, heldout.judge(Guess()))):
-        sizes.append(_missing_forces(one, own))
-    return _Result(judged, patched, then, now, np.array(sizes))
+    form = _root(now, uncertain_form(mechanism, now, dict(zip(columns.names, evidence.changes(judged), strict=True))))
+    heldout = ForceEvidence(now, evidence.shape, form, evidence.uncertainty(judged)[: len(now.names)], (1.0,))
+    sizes = [_missing_forces(one, own) for one, own in ((evidence, judged), (heldout, heldout.judge(Guess())))]
+    return _Result(judged, calibration, patched, then, now, np.array(sizes), heldout)
+
+
+def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]) -> _Result:
+    """Find what the held-out run alone has, if forces are missing there only; the rest is missing in the model."""
+    of_fit, of_heldout = result.is_lacking
+    if not np.any(of_heldout & ~of_fit):
+        return result
+    evidence, run = result.heldout, result.now.runs[0]
+    found = search_model(evidence, force_effects(chain, result.now, nominal, {}))
+    spread, first, told = np.sqrt(np.diag(evidence.covariance(found.judged))), 0, []
+    for h, deviation in found.guess.parts:
+        for (name, p), value, s in zip(
+            h.parameters.items(), h.values(deviation).values(), spread[first:], strict=False
+        ):
+            place = h.location.removesuffix(f".{run}")
+            more = "start {:.4g} s, duration {:.4g} s".format(*h.interval) if is_local(h) else ""
+            sizes = {run: (value - p.nominal, float(s * p.prior_std))}
+            told.append(RunDifference(f"{h.name}.{place}.{name}", p.unit, math.nan, sizes, details=more))
+        first += h.size
+    return replace(
+        result, sizes=np.array([result.sizes[0], _missing_forces(evidence, found.judged)]), differences=tuple(told)
+    )
 
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
     """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
-    rest = evidence.columns.gap - evidence.force_of(judged.guess)
-    found = evidence.shape.missing_forces(rest, evidence.columns.doubt)
+    noise = judged.tracks[0].levels.noise
+    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt, noise)
     return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
 
 
@@ -421,19 +477,24 @@ def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float
 def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
     """Effect -> its probability, and those of its alternatives.
 
-    The probability against rivals and none is scaled with that of the fraction of the residual force's variance which
-    the effect explains, on the drive that it moves most.
+    The probability against rivals and none is scaled with that of the fraction of the variance of the missing force
+    that the effect explains, on the drive that it moves most.
     """
     out = {}
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
         rest = found.without[index]
-        if hypothesis.name == CALIBRATION or rest is None:
+        if rest is None:
             continue
-        rivals = [r for r in found.rivals[index] if np.isfinite(r.judged.loss)]
-        table = effect_probabilities(found.judged, found.charges[index], rest, rivals)
-        moved = np.sqrt(np.mean(evidence.force_of(Guess(((hypothesis, deviation),))) ** 2, axis=0))
-        own = int(np.argmax(moved / evidence.shape.std))
-        now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, rest))
+        rivals = [
+            replace(r, occam_penalty=r.occam_penalty + _penalty(r.judged) - _penalty(rest))
+            for r in found.rivals[index] if np.isfinite(r.judged.loss)
+        ]  # fmt: skip
+        charge = found.charges[index] + _penalty(found.judged) - _penalty(rest)
+        table = effect_probabilities(found.judged, charge, rest, rivals)
+        force = evidence.force_of(Guess(((hypothesis, deviation),)))
+        own = int(np.argmax(np.sqrt(np.mean(force**2, axis=0)) / evidence.shape.std))
+        alike = evidence.judge_alike(rest.guess, found.judged)  # its uncertain parameters must not take the place
+        now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, alike))
         trust = believed_part(1.0 - now / without if without > now else 0.0)
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
@@ -443,49 +504,61 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
     return out
 
 
+def _penalty(judged: Judged) -> float:
+    """Cost of the noise levels and of the marginalised parameters, which the blocks of the runs do not hold."""
+    return judged.tracks[0].levels.penalty
+
+
 def _describe_effects(
     task: _Task, evidence: ForceEvidence, result: _Result, chances: Mapping[Key, tuple[float, tuple[Alternative, ...]]]
 ) -> tuple[NamedEffect, ...]:  # fmt: skip
-    """Effects of a model with probabilities, intervals, and the fraction of the held-out gap that each closes."""
+    """Effects of a model with probabilities, intervals, and the fraction of the gap that each closes.
+
+    The gap is that of the held-out run, and of the drive that the effect moves most.
+    """
     guess, then, now = result.judged.guess, result.then, result.now
     if not guess.parts:
         return ()
     spread = np.sqrt(np.diag(evidence.covariance(result.judged)))
-    rows = min(len(then.time), len(now.time))
-    shape = evidence.shape
-    before, after = (shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now))
-    whole, first, named = float(np.mean(before**2)) - 1.0, 0, []
+    rows, shape, fit = min(len(then.time), len(now.time)), evidence.shape, evidence.columns
+    errors = [shape.weights(c.doubt)[:rows] * c.gap[:rows] / shape.std for c in (then, now)]
+    weight, rest = shape.weights(fit.doubt) / shape.std, evidence.remaining_force(result.judged)
+    first, named = 0, []
     for hypothesis, deviation in guess.parts:
         std = spread[first : first + hypothesis.size]
         first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            continue
-        force = then.matrix[:rows] @ evidence.coefficients(Guess(((hypothesis, deviation),)))
-        added = shape.weights(then.doubt)[:rows] * force / shape.std
-        back = float(np.mean((after + added) ** 2) - np.mean(after**2))
+        change = evidence.coefficients(Guess(((hypothesis, deviation),)))
+        if is_local(hypothesis):  # it acts in a fitted run
+            before, after, added = weight * fit.gap, weight * rest, weight * (fit.matrix @ change)
+        else:
+            force = then.matrix[:rows] @ change[: len(then.names)]
+            before, after = errors
+            added = shape.weights(then.doubt)[:rows] * force / shape.std
+        own = int(np.argmax(np.mean(added**2, axis=0)))  # the drive that it moves most
+        whole = float(np.mean(before[:, own] ** 2)) - 1.0
+        back = float(np.mean((after + added)[:, own] ** 2) - np.mean(after[:, own] ** 2))
         share = float(np.clip(back / whole, 0.0, 1.0)) if whole > 0.0 else 0.0
         values, numbers = hypothesis.values(deviation), {}
         for (name, p), s in zip(hypothesis.parameters.items(), std, strict=True):
-            reach = _NORMAL95 * s * p.prior_std
+            reach = NORMAL95 * s * p.prior_std
             low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
             numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
+        if is_local(hypothesis):
+            for name, value in zip(("start", "duration"), hypothesis.interval, strict=True):
+                numbers[name] = Estimate(value, "s", value - fit.spacing, value + fit.spacing, 0.0)
         chance, others = chances[hypothesis.key]
         named.append(NamedEffect(*hypothesis.key, chance, numbers, others, share))
     return tuple(sorted(named, key=lambda e: (-round(e.probability, 3), -e.share)))
 
 
-def _calibration(task: _Task, evidence: ForceEvidence, judged: Judged) -> dict[str, Estimate]:
+def _calibration(task: _Task, result: _Result) -> dict[str, Estimate]:
     """Calibrated parameters that differ from the MJCF."""
-    told, first = {}, 0
-    spread = np.sqrt(np.diag(evidence.covariance(judged))) if judged.guess.parts else np.zeros(0)
-    for hypothesis, deviation in judged.guess.parts:
-        own = spread[first : first + hypothesis.size]
-        first += hypothesis.size
-        if hypothesis.name == CALIBRATION:
-            for (name, p), d, s in zip(hypothesis.parameters.items(), deviation, own, strict=True):
-                value, reach = p.nominal + d * p.prior_std, _NORMAL95 * s * p.prior_std
-                if abs(d) > _DISTINCT * s:
-                    told[name] = Estimate(value, p.unit, value - reach, value + reach, p.nominal)
+    told = {}
+    for name, (change, s) in result.calibration.items():
+        value, reach = task.nominal[name] + change, NORMAL95 * s
+        if abs(change) > _DISTINCT * s:
+            unit = parameter_unit(task.mechanism, name)
+            told[name] = Estimate(value, unit, value - reach, value + reach, task.nominal[name])
     return told
 
 
@@ -494,8 +567,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
     kind, _, place = name.partition(".")
     if kind in BODY_PARAMETERS:
         return BODY_PARAMETERS[kind]
-    chain = mechanism.setup.chain
-    force = "N" if place in chain.joints and chain.tree.is_slide[chain.index(place)] else "N m"
+    force = force_unit(mechanism.setup.chain, place)
     length = "m" if force == "N" else "rad"
     return {
         "viscous": f"{force} s/{length}", "viscous_asymmetry": f"{force} s/{length}",
@@ -514,7 +586,7 @@ def _predictions(
     """Predictions of the given or the patched model, the held-out run first."""
     channels, then, fit = _channels(task), result.then, evidence.columns
     error, doubt = (result.now.gap, result.now.doubt) if patched else (then.gap, then.doubt)
-    rest = fit.gap - evidence.force_of(result.judged.guess) if patched else fit.gap
+    rest = evidence.remaining_force(result.judged) if patched else fit.gap
 
     def prediction(run: str, time: np.ndarray, measured, error, doubt) -> Prediction:
         return Prediction(run, time, channels, measured - error, measured, shape.weights(doubt) * error / shape.std)
@@ -587,7 +659,7 @@ def _traces(task: _Task, evidence: ForceEvidence, result: _Result) -> tuple[Inpu
     """Force errors of the drive whose error is largest, over the first fitted run, with what the model adds."""
     columns = evidence.columns
     rows = slice(columns.starts[0], columns.starts[1])
-    added = evidence.force_of(result.judged.guess)[rows]
+    added = columns.gap[rows] - evidence.remaining_force(result.judged)[rows]
     order = np.argsort(-np.sqrt(np.mean(columns.gap**2, axis=0)) / evidence.shape.std)
     return tuple(
         InputTrace(

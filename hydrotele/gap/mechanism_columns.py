@@ -68,6 +68,7 @@ class Columns:
         row: between the readings that they are made of [s].
         runs: names.
         drives: names of the k drives.
+        units: of their forces.
     """
 
     names: tuple[str, ...]
@@ -84,6 +85,7 @@ class Columns:
     row: float
     runs: tuple[str, ...]
     drives: tuple[str, ...]
+    units: tuple[str, ...] = ()
 
     @property
     def gap(self) -> np.ndarray:
@@ -222,7 +224,13 @@ def build_columns(
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
         states, sizes, band, parts[0][7], row, tuple(r.name for r in records), tuple(setup.chain.drives),
+        tuple(force_unit(setup.chain, drive) for drive in setup.chain.drives),
     )  # fmt: skip
+
+
+def force_unit(chain: Chain, joint: str) -> str:
+    """Return the unit of the force of a joint, or of the friction of a closure."""
+    return "N" if joint in chain.joints and chain.tree.is_slide[chain.index(joint)] else "N m"
 
 
 def _averaged(record: IdentificationRecord, many: int) -> IdentificationRecord:
@@ -279,7 +287,7 @@ def _run_columns(
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    of_drives, quick = _drive_columns(setup, fine, sizes, value, record.period)
+    of_drives, quick = _drive_columns(setup, fine, sizes, (table.nominal, value), record.period)
     quick = _onto(quick, band, record.period, own.time)
     rubs, turns, calm = _dry_friction(setup, fine, band, record.period)
     turns, calm = (_onto(one, band, record.period, own.time) for one in (turns, calm))
@@ -310,18 +318,25 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, period: float):
-    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, values, period: float):
+    """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m).
+
+    A scale has the forces of the given parameters, the first of `values`: with friction that was found, it could take
+    the place of that friction.
+    """
     chain = setup.chain
     found = setup.project_motion_on_drives(*motion)
     passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
-    base = setup.compute_regressor(found).matrix @ value + np.einsum("nkv,nv->nk", found.joint_projection, passive)
+    given, base = (
+        setup.compute_regressor(found).matrix @ np.array(values).T
+        + np.einsum("nkv,nv->nk", found.joint_projection, passive)[:, :, None]
+    ).transpose(2, 0, 1)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
     for k, drive in enumerate(chain.drives):
         own = np.arange(len(chain.drives)) == k
         names += [f"scale.force.{drive}", f"delay.force.{drive}"]
-        out += [base * own, -change * own]
+        out += [given * own, -change * own]
         j = chain.index(drive)
         share, rate = found.joint_projection[:, :, j], found.rate[:, j]
         middle = float(found.position[:, j].mean()) if drive not in sizes else sizes[drive][0]
@@ -443,6 +458,7 @@ SENTENCES = {
     "com_offset": "an offset of a body's centre of mass",
     "inertia_error": "different moments of inertia of a body about its centre of mass",
     "base_tilt": "a tilt of the base",
+    "force_pulse": "a constant force on a drive for a limited time in one run",
     "force_offset": "a constant in a drive's force: an offset of its sensor, or a constant load",
     "force_scale": "a scale error of a force sensor",
     "force_delay": "a delay of a force sensor",

@@ -319,20 +319,20 @@ def propose(
     """
     taken = {h.key for h in now.guess.hypotheses}
     versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
-    table = model.linearise(now.guess, versions, model.uncertain_parameters(now.guess))
+    uncertain = model.uncertain_parameters(now.guess)
+    table = model.linearise(now.guess, versions, uncertain)
     best: dict[tuple[str, str], Proposal] = {}
     varying: dict[tuple[str, str], Proposal] = {}
     columns = find_columns(table.parameters, table.versions, quantities or {})
     chosen: dict[tuple[str, str], int] = {}
     gains: dict[float, float] = {}
-    has_calibration = (CALIBRATION, "all") in taken
     starts: list[float] = []
 
     def compare(table: Linearisation) -> None:
         for residual_scale in RESIDUAL_SCALES:
             by_run, loss = table.equations(residual_scale)
             terms = sum_equations(by_run)
-            for parameter_scale in PARAMETER_SCALES[: 1 if has_calibration or table.laws else None]:
+            for parameter_scale in PARAMETER_SCALES[: 1 if not uncertain.size or table.laws else None]:
                 scales = np.where(table.is_own, OWN_SCALE, parameter_scale)
                 marginal = terms.marginalise(scales)
                 total = loss - terms.squares + marginal.loss

@@ -228,7 +228,7 @@ def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -
     return np.sqrt(error_variances[:, 0] / (error_variances[:, 0] + error_variances[:, 1] * sign_uncertainty**2))
 
 
-def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
+def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray, rounds: int = 0) -> np.ndarray:
     """Estimate each drive's error variance, and the variance added by an uncertain friction sign.
 
     The squared residual is modelled as `v + v_sign u^2` with the uncertainty u.
@@ -236,6 +236,8 @@ def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray)
     Args:
         residual: (n, k) residuals of a first estimate.
         sign_uncertainty: (n, k) uncertainty of the signs of dry friction, 0 (certain) to 1 (unknown).
+        rounds: rounds of Fisher scoring towards the maximum of the normal likelihood, in which each squared residual
+            has a weight by its own variance.
 
     Returns:
         (k, 2) both variances of each drive, by non-negative least squares on squared residuals;
@@ -245,9 +247,13 @@ def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray)
     for k in range(sign_uncertainty.shape[1]):
         square = residual[:, k] ** 2
         grows = np.column_stack([np.ones(len(square)), sign_uncertainty[:, k] ** 2])
-        calm, more = nnls(grows * square.size**-0.5, square * square.size**-0.5)[0]
-        if calm > 0.0:
+        weight = np.full(square.size, square.size**-0.5)
+        for _ in range(rounds + 1):
+            calm, more = nnls(grows * weight[:, None], square * weight)[0]
+            if calm <= 0.0:
+                break
             out[k] = calm, more
+            weight = calm / (grows @ out[k]) * square.size**-0.5
     return out
 
 
