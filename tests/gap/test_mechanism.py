@@ -214,7 +214,8 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
     gap = found_gap(tmp_path, "regression")
     named = {(e.name, e.location): e.parameters for e in gap.effects}
     assert set(named) == {("coulomb_friction", "j")}
-    assert gap.verdict == "named" or stribeck and gap.verdict == "partly"  # no effect of the library falls with the rate
+    # no effect of the library falls with the rate, so a part of Stribeck's effect may remain
+    assert gap.verdict in ("named", "partly" if stribeck else "named")
     dry = named["coulomb_friction", "j"]["coulomb"].value
     assert abs(dry - 1.0) < (0.05 if stribeck else 0.01)  # Stribeck's effect hides in friction that falls with the rate
 
