@@ -242,6 +242,7 @@ def find_gap(
     unbounded = dataclasses.replace(size, noise_floor=None)  # process noise may stand for what is missing
     if is_regression:
         failed = any(not test["passed"] for test in tests.values())
+        failed |= held_out is not None and held_out.is_worse  # a gap of the fitted runs remains
         named = tuple(
             with_profile(data.machine, effect, varied.get((effect.name, effect.location))) for effect in named
         )

@@ -19,7 +19,7 @@ Statistician 72(4)), so that channel k remains closest to drive k.
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
@@ -252,6 +252,11 @@ class ForceLevels(Levels):
     parameter_scale: float = 0.0
 
 
+def levels_of(judged: Judged) -> ForceLevels:
+    """Return the levels of a model of forces; all its runs have the same."""
+    return cast(ForceLevels, judged.tracks[0].levels)
+
+
 @dataclass(frozen=True)
 class ForceTrack:
     """Errors of one run: as `estimate.track.Track`, without states.
@@ -313,7 +318,7 @@ class ForceEvidence(GapModel):
         self._fade = float(np.exp(-columns.spacing / MEMORY))
         self.tracks: tuple[ForceTrack, ...] = ()
         ones = np.ones(columns.gap.shape[1])
-        self._levels = ForceLevels(ones, self._inputs, ones)
+        self._levels: ForceLevels = ForceLevels(ones, self._inputs, ones)
         self._roots: dict[bytes, tuple[np.ndarray, float]] = {}
         self._root, _ = self._root_of(self._levels)
 
@@ -436,7 +441,7 @@ class ForceEvidence(GapModel):
 
     def judge_from(self, guess: Guess, judged: Judged) -> Judged:
         """Re-estimate the levels of a set of effects from those of another model."""
-        own, self._levels = self._levels, judged.tracks[0].levels
+        own, self._levels = self._levels, levels_of(judged)
         try:
             return self.judge(guess)
         finally:
@@ -466,7 +471,7 @@ class ForceEvidence(GapModel):
 
     def residual_gain(self, judged: Judged) -> np.ndarray:
         """Return twice the log likelihood ratio (k,) of a residual force in each channel against none."""
-        levels = judged.tracks[0].levels
+        levels = levels_of(judged)
         left, losses = self._left(judged)[:, :, None], []
         for sizes in (levels.sizes, np.full(len(levels.sizes), np.exp(_LOG_SIZES[0]))):
             whitened, spread = self._filter_errors(left, replace(levels, sizes=sizes))
@@ -485,7 +490,8 @@ class ForceEvidence(GapModel):
 
     def set_base(self, judged: Judged) -> Judged:
         """Whiten with the levels of a set of effects."""
-        self.tracks, self._levels = judged.tracks, judged.tracks[0].levels  # type: ignore[assignment]
+        self.tracks = cast("tuple[ForceTrack, ...]", judged.tracks)
+        self._levels = levels_of(judged)
         self._root, _ = self._root_of(self._levels)
         return judged
 
@@ -508,7 +514,7 @@ class ForceEvidence(GapModel):
 
     def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension with scaled residual forces, and re-estimate the levels."""
-        self._levels = _shrink_levels(now.tracks[0].levels, residual_scale)
+        self._levels = _shrink_levels(levels_of(now), residual_scale)
         self._root, _ = self._root_of(self._levels)
         fit = self.fit(guess)
         judged = self.judge(fit.guess)
@@ -667,16 +673,16 @@ class ForceEvidence(GapModel):
     def judge_alike(self, guess: Guess, other: Judged) -> Judged:
         """Re-estimate the noise levels of a set of effects with the scale of the uncertain parameters of another."""
         self.set_base(other)
-        return self._judge(guess, (other.tracks[0].levels.parameter_scale,))
+        return self._judge(guess, (levels_of(other).parameter_scale,))
 
     def calibration_gain(self, judged: Judged) -> float:
         """Return twice the log evidence that the uncertain parameters bring against those of the given model."""
         self.set_base(judged)
-        return self._judge(judged.guess, (0.0,)).loss - judged.loss if judged.tracks[0].levels.parameter_scale else 0.0
+        return self._judge(judged.guess, (0.0,)).loss - judged.loss if levels_of(judged).parameter_scale else 0.0
 
     def _marginal_mean(self, judged: Judged) -> np.ndarray:
         """(r,) marginalised parameters."""
-        levels = judged.tracks[0].levels
+        levels = levels_of(judged)
         return self._marginalise(self._values @ self._sum_columns(judged.guess), levels, [levels.parameter_scale])[1]
 
     def _left(self, judged: Judged) -> np.ndarray:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
 from hydrotele.core.errors import InputError
@@ -197,11 +197,12 @@ def find_force_gap(
         untrue += varying.values()
         judged = _remove_effects(evidence, judged, varying)
     details: tuple[NamedEffect, ...] = ()
+    is_rejected = False
     then = build_columns([heldout], mechanism, task.band)
     result = _evaluate(task, evidence, judged, then)
     while True:
         if not _error_ratio(task, evidence, result) <= _WORSE:
-            untrue.append(_REJECTED)
+            is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
             evidence, found = _given_model(task)
             result = _evaluate(task, evidence, found.judged, then)
         named = _describe_effects(task, evidence, result, chances)
@@ -235,7 +236,8 @@ def find_force_gap(
     more += [words for effect in named if (words := answer_words(effect))]
     tell("done", 1.0)
     return Gap(
-        machine=given, patched=result.patched, verdict=verdict_of(named, bool(result.is_lacking.any()), 1.0),
+        machine=given, patched=result.patched,
+        verdict=verdict_of(named, is_rejected or bool(result.is_lacking.any()), 1.0),
         effects=named, unknown=unknown, size=GapSize(total[0], total[1], 1.0, METRIC), ranking=_ranking(found),
         before=before, after=after,
         laws={"force": {
@@ -319,7 +321,7 @@ def _search(task: _Task, names: Sequence[str], tell: Progress) -> tuple[ForceEvi
         )
         sensors = [pair for pair in task.effects_of(found.guess) if sensor_errors([pair], chain, joints)]
         known = [*sensors, *(pair for pair in task.effects_of(found.guess) if pair[0].name in _CHANGING)]
-        pulses = evidence.force_of(Guess(tuple(part for part in found.guess.parts if is_local(part[0]))))
+        pulses = evidence.force_of(Guess(tuple(part for part in found.guess.parts if interval_of(part[0]))))
         value = evidence.changes(found.judged)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in task.nominal}
         steps = [np.abs(v - applied.get(h.key, [p.nominal for p in h.parameters.values()]))
@@ -353,9 +355,9 @@ def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     return evidence, Found(judged, judged, None, (), (), (), (), None)
 
 
-def is_local(hypothesis: Hypothesis) -> bool:
-    """Return whether an effect acts in one run only, for a limited time."""
-    return isinstance(hypothesis, ForceEffect) and hypothesis.interval is not None
+def interval_of(hypothesis: Hypothesis) -> tuple[float, float] | None:
+    """Return start and duration [s] of an effect that acts in one run for a limited time, None for others."""
+    return hypothesis.interval if isinstance(hypothesis, ForceEffect) else None
 
 
 def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
@@ -383,7 +385,7 @@ def _remove_effects(evidence: ForceEvidence, judged: Judged, dropped: Collection
 def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     """Return effects with one parameter whose mean over the runs is not known, because they differ -> a sentence.
 
-    They are rejected if the 95 % interval of the mean, by Student's distribution, holds 0. Of a single run, its parts
+    They are rejected if the 95 % interval of the mean holds 0. Of a single run, its parts
     take the place of the runs.
     """
     told: dict[Key, str] = {}
@@ -391,7 +393,7 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
     runs = np.repeat(np.arange(len(columns.runs), dtype=float), np.diff(columns.starts))
     last = columns.time.max()
     for hypothesis, deviation in judged.guess.parts:
-        if hypothesis.size > 1 or is_local(hypothesis):
+        if hypothesis.size > 1 or interval_of(hypothesis):
             continue
         force = evidence.force_of(Guess(((hypothesis, deviation),)))
         factors, values = evidence.compare_laws(judged, force, [(runs * last + columns.time,)])
@@ -401,11 +403,23 @@ def _varying(evidence: ForceEvidence, judged: Judged) -> dict[Key, str]:
             low, high = np.quantile(runs * last + columns.time, QUANTILES)
             of_run = (np.linspace(low, high, len(ratios)) // last).astype(int)
             each = np.array([ratios[of_run == run].mean() for run in range(count) if np.any(of_run == run)])
-        error = np.std(each, ddof=1) / math.sqrt(len(each))
-        is_known = abs(each.mean()) > student_t.ppf(0.975, len(each) - 1) * error
-        if factors[0] > MIN_LOG_BAYES_FACTOR and not is_known:
+        if factors[0] > MIN_LOG_BAYES_FACTOR and _sign_doubt(each) > 0.025:
             told[hypothesis.key] = _DIFFERS.format(*hypothesis.key, ratios.min(), ratios.max(), factors[0])
     return told
+
+
+def _sign_doubt(values: np.ndarray) -> float:
+    """Return the probability that the mean (of which `values` (n,) are samples) has not the sign of their average.
+
+    Normal samples; a flat prior of the mean, and of the standard deviation between 0 and the average: an effect that
+    varies by more than its size has no constant parameter.
+    """
+    mean, count = abs(float(values.mean())), len(values)
+    widths = mean * np.linspace(0.01, 1.0, 100)
+    square = float(np.sum((values - values.mean()) ** 2))
+    log = -(count - 1) * np.log(widths) - 0.5 * square / widths**2
+    weights = np.exp(log - log.max())
+    return float(weights @ norm.cdf(-mean * math.sqrt(count) / widths) / weights.sum())
 
 
 def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Columns) -> _Result:
@@ -449,7 +463,7 @@ def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]
             h.parameters.items(), h.values(deviation).values(), spread[first:], strict=False
         ):
             place = h.location.removesuffix(f".{run}")
-            more = "start {:.4g} s, duration {:.4g} s".format(*h.interval) if is_local(h) else ""
+            more = "start {:.4g} s, duration {:.4g} s".format(*interval) if (interval := interval_of(h)) else ""
             sizes = {run: (value - p.nominal, float(s * p.prior_std))}
             told.append(RunDifference(f"{h.name}.{place}.{name}", p.unit, math.nan, sizes, details=more))
         first += h.size
@@ -528,7 +542,7 @@ def _describe_effects(
         std = spread[first : first + hypothesis.size]
         first += hypothesis.size
         change = evidence.coefficients(Guess(((hypothesis, deviation),)))
-        if is_local(hypothesis):  # it acts in a fitted run
+        if interval_of(hypothesis):  # it acts in a fitted run
             before, after, added = weight * fit.gap, weight * rest, weight * (fit.matrix @ change)
         else:
             force = then.matrix[:rows] @ change[: len(then.names)]
@@ -543,8 +557,8 @@ def _describe_effects(
             reach = NORMAL95 * s * p.prior_std
             low, high = max(p.lower_bound, values[name] - reach), min(p.upper_bound, values[name] + reach)
             numbers[name] = Estimate(values[name], p.unit, low, high, p.nominal)
-        if is_local(hypothesis):
-            for name, value in zip(("start", "duration"), hypothesis.interval, strict=True):
+        if interval := interval_of(hypothesis):
+            for name, value in zip(("start", "duration"), interval, strict=True):
                 numbers[name] = Estimate(value, "s", value - fit.spacing, value + fit.spacing, 0.0)
         chance, others = chances[hypothesis.key]
         named.append(NamedEffect(*hypothesis.key, chance, numbers, others, share))

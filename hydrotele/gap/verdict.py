@@ -132,7 +132,7 @@ def verdict_of(named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], failed:
     Args:
         named: the effects.
         laws: learned laws without a known cause.
-        failed: whether a residual test of the final model fails.
+        failed: whether a residual test of the final model fails, or changes that the fitted runs support were rejected.
         size: of the gap on the held-out run. Laws alone are `learned` if they close `SURE` of it.
     """
     likely = [e for e in named if e.mechanism_probability > LIKELY]

@@ -122,10 +122,10 @@ def test_a_model_that_fits_has_no_gap_and_is_left_alone(tmp_path, method):
 
 
 @pytest.mark.nightly
-def test_friction_is_named_beside_late_sensors(tmp_path, method):
+def test_friction_is_named_beside_late_sensors(tmp_path):
     """Both positions are late: how late against the forces is told, not always in fewest names."""
     logs(tmp_path, ARM.replace('frictionloss="0.8"', 'frictionloss="2.4"'), late=0.012)
-    gap = found_gap(tmp_path, method)
+    gap = found_gap(tmp_path, "search")
     named = {(e.name, e.location): e.parameters for e in gap.effects}
     assert gap.verdict == "named", named
     dry = named["coulomb_friction", "elbow"]["coulomb"]
@@ -217,7 +217,7 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
     # no effect of the library falls with the rate, so a part of Stribeck's effect may remain
     assert gap.verdict in ("named", "partly" if stribeck else "named")
     dry = named["coulomb_friction", "j"]["coulomb"].value
-    assert abs(dry - 1.0) < (0.05 if stribeck else 0.01)  # Stribeck's effect hides in friction that falls with the rate
+    assert abs(dry - 1.0) < (0.15 if stribeck else 0.01)  # rows near rest, where the effect acts, are left out
 
 
 def test_a_law_outside_the_library_is_located_but_not_named(tmp_path, method):
