@@ -152,7 +152,6 @@ def test_normal_equations_give_the_gauss_markov_estimate():
     )  # rounding of a sum over 300 rows
 
 
-@pytest.mark.nightly
 def test_distances_of_the_trials_have_their_distribution():
     settings = trials.TRIAL_SETTINGS | {"friction_excess": 0.0, "trials": 60}
     found = trials.simulate_trials(1, settings)
@@ -162,7 +161,6 @@ def test_distances_of_the_trials_have_their_distribution():
     assert abs(chi2.ppf(0.95, 24) - CHI2_LIMIT) < 0.005  # two printed decimals
 
 
-@pytest.mark.nightly
 def test_only_friction_that_warms_up_brings_the_first_trial_out():
     cold = trials.compute_trial_statistics(1, {"trials": 30}).values
     assert cold["first distance"] > CHI2_LIMIT > 0.0
@@ -173,7 +171,6 @@ def test_only_friction_that_warms_up_brings_the_first_trial_out():
     assert warm["first distance"] == pytest.approx(cold["warm first distance"], rel=0.2)
 
 
-@pytest.mark.nightly
 def test_small_covariance_is_found():
     few = {"trials": 30}
     claims = ("history of the estimates", "all other trials within the ellipsoid")
@@ -195,7 +192,6 @@ def test_bias_is_found_where_it_is_and_not_where_it_is_not():
     assert ncx2.cdf(distance, 24, squared) == pytest.approx(0.025, rel=1e-6)
 
 
-@pytest.mark.nightly
 def test_encoder_noise_that_controllers_pass_on_biases_samples_but_not_periods():
     arrays = trials.measure_bias_by_encoder_feedback(1, {}).arrays
     rms = {name: float(np.sqrt(np.mean(error**2))) for name, error in arrays.items()}

@@ -89,7 +89,6 @@ def test_dimensions_agree_and_other_dimensions_differ():
         assert broken.verdict == "differs", broken.simulated
 
 
-@pytest.mark.nightly
 def test_identifiable_lists_are_those_of_the_document():
     claim = khoshzaban_machine.EXPERIMENTS[1].claims[0]
     assert claim.compare([find_identifiable_parameters(1, {})]).verdict == "agrees"
@@ -165,7 +164,6 @@ def test_drift_alone_leaves_errors_of_the_published_size():
     assert max(errors) < 1e-9  # rounding
 
 
-@pytest.mark.nightly
 def test_bent_joints_are_left_out_and_leave_smaller_errors():
     """Bends of 4 deg: without these poses the stick's twists are right to the sensors' noise."""
     values = measure_calibration_errors(1, {"poses": 0.4, "bend": (4.0, 4.0)}).values

@@ -228,7 +228,6 @@ def test_every_claim_with_a_verdict_has_a_broken_run():
             assert bool(claim.fault_description) == (claim.fault is not None)
 
 
-@pytest.mark.nightly
 def test_a_prediction_by_the_reduced_model_is_as_good():
     (sample,) = [PREDICTION.measure(1, {})]
     for drive in ("swing", "boom", "stick"):
@@ -238,5 +237,5 @@ def test_a_prediction_by_the_reduced_model_is_as_good():
         assert reduced == pytest.approx(complete, rel=0.02)
         assert nominal > 1.3 * complete
     assert {panel.error_label for panel in sample.panels[2:]} == {
-        "predicted less measured [N m]", "predicted less measured [N]"
+        "predicted minus measured [N m]", "predicted minus measured [N]"
     }  # fmt: skip

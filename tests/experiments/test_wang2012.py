@@ -53,7 +53,13 @@ def measure(one: Experiment, changes, count: int) -> list[Sample]:
     return [one.measure(seed, changes) for seed in range(1, one.repetitions(count) + 1)]
 
 
-@pytest.mark.daily("20 poses with wires-few")
+@pytest.mark.daily(
+    "20 poses with wires-few",
+    "POE model: 25 poses-few",
+    "3-2-1 wires-few",
+    "first-order error model-few",
+    "independent parameters-few",
+)
 @pytest.mark.parametrize("counts", [DAILY, pytest.param(NIGHTLY, marks=pytest.mark.nightly)], ids=["few", "many"])
 @pytest.mark.parametrize("one", FAST, ids=lambda one: one.name)
 def test_rows_agree_and_their_broken_runs_differ(one: Experiment, counts):

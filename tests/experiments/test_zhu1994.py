@@ -83,7 +83,6 @@ def test_every_table_and_figure_is_there(kind, number):
     raise AssertionError(f"no row for {kind} {number}")
 
 
-@pytest.mark.nightly
 def test_criteria_fail_on_a_broken_run():
     names = {c.name for c in zhu_tables.TABLE_COMPARISON.claims}
     rows = [row for _, row in run_with_faults(SERIES, sorted(names), jobs=1)]
@@ -128,7 +127,6 @@ def test_a_line_is_straight():
     assert claim.compare([stray, stray]).verdict == "differs"
 
 
-@pytest.mark.nightly
 def test_direct_force_is_unstable_when_large():
     assert zhu_contact_forces.measure_direct_feedback(4.0e-4, 1, {}).values["ripple"] > 0.5
 

@@ -68,7 +68,15 @@ def test_claims_can_be_broken_and_begin_with_their_page():
             assert claim.fault is not None and claim.fault_description, claim.name
 
 
-@pytest.mark.daily("inverse kinematics", "force feed-forward error")
+@pytest.mark.daily(
+    "inverse kinematics",
+    "force feed-forward error",
+    "direct force, linear",
+    "damping that rises",
+    "four channels, position control",
+    "delayed channel",
+    "intervening impedance",
+)
 @pytest.mark.parametrize("one", [e for e in EXPERIMENTS if e.fixed_repetitions == 1],
                          ids=lambda one: one.name)  # fmt: skip
 def test_exact_rows_agree_and_differ_when_broken(one):

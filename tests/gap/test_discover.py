@@ -242,7 +242,6 @@ def cut(told, values):
     return [(readings(told[c]), {name: x[c] for name, x in values.items()}) for c in CUT]
 
 
-@pytest.mark.nightly
 def test_thresholds_of_a_relay_are_found():
     """A constant that a pressure switches, in noise as large: to a tenth of the range."""
     rng = np.random.default_rng(4)
