@@ -160,7 +160,9 @@ class _UrdfReader:
         if self.missing:
             names = list(dict.fromkeys(self.missing))
             more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-            self.notes.append(f"meshes not found or empty: {', '.join(names[:3])}{more}")
+            self.notes.append(
+                f"meshes not found or empty: {', '.join(names[:3])}{more}; collision shapes are shown instead"
+            )
         return Robot(root.get("name") or self.path.stem, ordered, [], self.notes)
 
     def _read_link(self, element, name: str, colours: dict) -> RobotLink:
@@ -175,6 +177,7 @@ class _UrdfReader:
             link.visuals += self._read_shapes(visual, rgba)
         for collision in element.findall("collision"):
             link.collisions += self._read_shapes(collision, None)
+        link.visuals = link.visuals or list(link.collisions)  # meshes that are missing
         if (inertial := element.find("inertial")) is not None:
             rotation, centre = self._pose(inertial)
             mass, inertia = inertial.find("mass"), inertial.find("inertia")
