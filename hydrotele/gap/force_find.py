@@ -445,7 +445,10 @@ def _evaluate(task: _Task, evidence: ForceEvidence, judged: Judged, then: Column
             better = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
         now = build_columns([task.heldout], better, task.band, patch.errors)
     form = _root(now, uncertain_form(mechanism, now, dict(zip(columns.names, evidence.changes(judged), strict=True))))
-    heldout = ForceEvidence(now, evidence.shape, form, evidence.uncertainty(judged)[: len(now.names)], (1.0,))
+    known = dict(zip(evidence.columns.names, evidence.uncertainty(judged), strict=True))
+    nothing = np.zeros_like(next(iter(known.values())))
+    spread = np.array([known.get(name, nothing) for name in now.names])
+    heldout = ForceEvidence(now, evidence.shape, form, spread, (1.0,))
     sizes = [_missing_forces(one, own) for one, own in ((evidence, judged), (heldout, heldout.judge(Guess())))]
     return _Result(judged, calibration, patched, then, now, np.array(sizes), heldout)
 

@@ -72,7 +72,7 @@ def open_loop_errors(
         chain: kinematic chain of the same mechanism.
         known_joints: names of the k joints with known motion.
         motion: (3, n, k) positions, rates and accelerations of these joints.
-        force: (n, k) measured forces of the drives [N] or [N m].
+        force: (n, k) measured forces of the drives [N] or [N m]; no interval begins where NaN follow.
         period: time between rows [s].
         horizon: simulated time after which the positions are compared [s].
         starts: maximum number of start instants, equally spaced over the motion.
@@ -81,13 +81,17 @@ def open_loop_errors(
         Drive -> RMS position error after the horizon [rad] or [m].
 
     Raises:
-        InputError: the motion is shorter than the horizon, or the simulation fails.
+        InputError: the motion is shorter than the horizon, forces are missing everywhere, or the simulation fails.
     """
     steps = round(horizon / model.opt.timestep)
     rows = round(horizon / period)
     if motion.shape[1] <= rows:
         raise InputError(_ERROR_LOCATION, f"the run is shorter than {horizon:g} s")
-    firsts = np.unique(np.linspace(0, motion.shape[1] - rows - 1, starts).astype(int))
+    missing = np.append(0, np.cumsum(~np.isfinite(force).all(axis=1)))
+    possible = np.flatnonzero(missing[rows + 1 :] == missing[: -rows - 1])
+    if not len(possible):
+        raise InputError(_ERROR_LOCATION, f"forces are missing in every interval of {horizon:g} s")
+    firsts = possible[np.unique(np.linspace(0, len(possible) - 1, starts).astype(int))]
     found = project_on_drives(chain, tuple(known_joints), *motion)
     data, drives = mujoco.MjData(model), [chain.index(name) for name in chain.drives]
     dofs = [int(chain.dof_indices[j]) for j in drives]
