@@ -364,6 +364,8 @@ class Machine(StrictModel):
                 _check_name_is_known(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
+            for mounted, sensor in sensors.mounted.items():
+                _check_name_is_known(sensor.link, known, f"sensors.{name}.mounted.{mounted}.link")
             for channel in sensors.channels:
                 _check_name_is_known(channel, self.sensed_channels, f"sensors.{name}.channels")
         for name, axis in self.axes.items():

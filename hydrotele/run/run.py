@@ -39,6 +39,7 @@ from hydrotele.simulate.conservation_checks import compute_balance_errors
 from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import Record
+from hydrotele.simulate.retrofit_sensors import simulate_retrofit_readings
 from hydrotele.simulate.sensor_models import Feedback, create_feedback, simulate_readings
 from hydrotele.simulate.stepping import delayed_commands
 from hydrotele.simulate.true_values import delayed_channels, true_channels
@@ -357,6 +358,10 @@ def _make_logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback)
     visible |= delayed_channels(plant, record)
     readings |= simulate_readings(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
     units = {c: units[c] for c in readings}
+    if sensors:
+        readings = {c: v for c, v in readings.items() if not c.startswith(sensors.absent)}
+        added, added_units = simulate_retrofit_readings(plant, sensors, record, values, scenario.seed)
+        readings, units = readings | added, {c: units[c] for c in readings} | added_units
     return truth, _make_log(scenario, machine, record.time, readings, units, scenario.sensors)
 
 
