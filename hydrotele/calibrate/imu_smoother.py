@@ -71,12 +71,14 @@ class SmoothedRun(NamedTuple):
     """Estimated joint motion of a run.
 
     Attributes:
+        name: name of the run.
         motion: (3, a, n) joint positions, velocities and accelerations at the rows.
         noise: (a,) median standard deviation of a position due to the noise of the readings [rad] or [m].
         offset: (a,) median standard deviation of a position due to the parameters [rad] or [m].
         residual_rms: (s, 2) RMS of the residuals of gyro and accelerometer, relative to their noise.
     """
 
+    name: str
     motion: np.ndarray
     noise: np.ndarray
     offset: np.ndarray
@@ -145,7 +147,7 @@ def smooth_imus(
     results = []
     for k, (run, spline, solved) in enumerate(zip(runs, splines, coefficients, strict=True)):
         white, common = _position_deviations(spline, factors[k], normals[k].border, covariance, run.position.shape[0])
-        results.append(SmoothedRun(_evaluate(spline, solved), white, common, rms[k]))
+        results.append(SmoothedRun(run.name, _evaluate(spline, solved), white, common, rms[k]))
     deviations = mean.from_vector(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return SmoothedImus(mean.from_vector(parameters), deviations, tuple(results))
 
