@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from hydrotele.calibrate.imu_model import ImuChain, build_imu_chain, rotation_from_parameters
@@ -210,8 +211,7 @@ def _estimate_start(chain: ImuChain, run: ImuRun) -> np.ndarray:
         axis = np.array(link.joint.axis)
         frame = Rotation.from_rotvec(chain.sensors[imu].rotation).as_matrix()
         readings = np.array([_fill_gaps(run.time, values) for values in run.readings[imu]])
-        force = frame @ np.array([np.convolve(np.pad(v, window, "edge"), np.ones(window) / window, "same")[window:-window]
-                                  for v in readings[3:]])  # fmt: skip
+        force = frame @ uniform_filter1d(readings[3:], window, axis=1, mode="nearest")
         up = _up_in_link(chain, link.parent, start)
         along = axis @ up
         if np.mean(np.abs(along)) > _VERTICAL_COSINE * np.linalg.norm(chain.gravity):
@@ -279,7 +279,9 @@ def _add_rest(
             continue
         command = f"command.{axis}"
         if command not in log:
-            notes.append(f"{log.name} has no {command}: the drift of {axis} is limited by the prior of the gyro bias only.")
+            notes.append(
+                f"{log.name} has no {command}: the drift of {axis} is limited by the prior of the gyro bias only."
+            )
             continue
         valve = machine.axes[axis].valve
         driven = np.abs(log[command]) > (valve.deadband if valve else 0.0)

@@ -136,7 +136,9 @@ def smooth_imus(
     coefficients = [_interpolate_start(run.time, s, q) for run, s, q in zip(runs, splines, start, strict=True)]
     parameters = mean.to_vector()
     for _ in range(2):
-        parameters, coefficients, normals = _minimise(chain, runs, splines, coefficients, parameters, mean, prior_sd, noise)
+        parameters, coefficients, normals = _minimise(
+            chain, runs, splines, coefficients, parameters, mean, prior_sd, noise
+        )
         rms = _residual_rms(runs, normals)
         weights = np.array([np.isfinite(run.readings).sum() for run in runs], float)
         pooled = np.sqrt(np.einsum("r,rsk->sk", weights, rms**2) / weights.sum())
@@ -211,7 +213,9 @@ def _evaluate(spline: _Spline, coefficients: np.ndarray) -> np.ndarray:
     return np.einsum("dnk,nka->dan", spline.basis, local)
 
 
-def _assemble(chain, run: ImuRun, place: int, spline: _Spline, coefficients, parameters: ImuParameters, noise) -> _Normal:
+def _assemble(
+    chain, run: ImuRun, place: int, spline: _Spline, coefficients, parameters: ImuParameters, noise
+) -> _Normal:
     """Return the normal equations of a run, linearised at coefficients (c, a) and parameters."""
     axes, imus = coefficients.shape[1], len(chain.imus)
     motion = _evaluate(spline, coefficients)
@@ -235,7 +239,11 @@ def _assemble(chain, run: ImuRun, place: int, spline: _Spline, coefficients, par
         corner_gradient += flat.T @ residual.ravel()
         cost += float(np.sum(residual**2))
         squares += np.sum(residual[: 6 * imus].reshape(imus, 2, -1) ** 2, axis=2)
-    band, wide, slope = np.zeros((width, spline.count * axes)), np.zeros((spline.count * axes, size)), np.zeros(spline.count * axes)
+    band, wide, slope = (
+        np.zeros((width, spline.count * axes)),
+        np.zeros((spline.count * axes, size)),
+        np.zeros(spline.count * axes),
+    )
     last = intervals * axes
     for b in range(width):
         for a in range(b, width):
@@ -272,7 +280,7 @@ def _linearise(chain, run: ImuRun, place: int, motion, parameters: ImuParameters
 
     def derivative(motion, mounting, tilt):
         changed = predict_imu_readings(chain, motion, mounting, tilt)
-        return weight * changed.imag / _COMPLEX_STEP
+        return weight * np.imag(changed) / _COMPLEX_STEP
 
     for d in range(3):
         for a in range(axes):

@@ -76,11 +76,11 @@ def imu_calibration_to_dict(result: ImuCalibration) -> dict[str, Any]:
         values = [np.concatenate([part.mounting[k], part.gyro_bias[:, k].mean(axis=0)])
                   for part in (found, deviation, prior)]  # fmt: skip
         sensor = result.machine.sensors[result.sensors].mounted[name]
+        turn = Rotation.from_rotvec(result.chain.sensors[k].rotation).inv() * Rotation.from_rotvec(sensor.rotation)
         imus[name] = {
             "link": sensor.link,
             "rotation": sensor.rotation,
-            "rotation_from_nominal_deg": float(np.degrees(
-                (Rotation.from_rotvec(result.chain.sensors[k].rotation).inv() * Rotation.from_rotvec(sensor.rotation)).magnitude())),
+            "rotation_from_nominal_deg": float(np.degrees(turn.magnitude())),
             "parameters": {
                 name: {"value": value, "standard_deviation": sd, "identifiable": bool(sd < MAX_SD_RATIO * before)}
                 for name, value, sd, before in zip(_PARAMETERS, *values, strict=True)

@@ -23,6 +23,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import describe_excess
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
 from hydrotele.machine.log_columns import LogColumnEntry
+from hydrotele.machine.oil import Oil
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet, make_channel_converter
 from hydrotele.terms.term import Term
 
@@ -199,6 +200,7 @@ class Machine(StrictModel):
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
     loads: dict[Name, LoadCylinder] = {}
+    oil: Oil | None = None
     sensors: dict[Name, SensorSet] = {}
     sensor_errors: dict[str, SensorError] = {}
     home: dict[Name, float] = {}

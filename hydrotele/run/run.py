@@ -29,6 +29,7 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.oil import with_oil_temperature
 from hydrotele.run.session import PreparedRun, Session
 from hydrotele.run.tick_loop import (
     start_background_compilation,
@@ -231,6 +232,8 @@ def prepare_run(scenario: Scenario) -> PreparedRun:
     """
     nominal = load_nominal_machine(scenario)
     machine = add_scenario_effects(nominal, scenario)
+    if scenario.oil_temperature is not None:
+        machine = with_oil_temperature(machine, scenario.oil_temperature)
     sensors = get_sensor_set(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
     data, start = _initial_data(plant, scenario)

@@ -50,7 +50,8 @@ def compute_link_motion(model: mujoco.MjModel, record: Record, bodies: list[int]
             mujoco.mj_objectVelocity(model, data, kind, body, velocity, 1)
             mujoco.mj_objectAcceleration(model, data, kind, body, acceleration, 1)
             motion.rate[row, k], motion.acceleration[row, k] = velocity[:3], acceleration[:3]
-            motion.force[row, k] = acceleration[3:]
+            fixed = model.body_weldid[body] == 0  # MuJoCo returns 0 for these bodies
+            motion.force[row, k] = data.xmat[body].reshape(3, 3).T @ -model.opt.gravity if fixed else acceleration[3:]
     return motion
 
 
@@ -70,15 +71,13 @@ def simulate_retrofit_readings(
         (channel -> (n,) readings in SI, channel -> unit).
     """
     period = float(record.time[1] - record.time[0]) if len(record.time) > 1 else 0.0
-    readings, units = _simulate_scalar_readings(plant, sensors, truth, seed)
+    readings, units = _simulate_scalar_readings(plant, sensors, truth, len(record.time), seed)
     names = list(dict.fromkeys(sensor.link for sensor in sensors.mounted.values()))
     if names:
         motion = compute_link_motion(plant.model, record, [plant.model.body(name).id for name in names])
     for name, sensor in sensors.mounted.items():
         k = names.index(sensor.link)
-        values = mounted_sensor_values(
-            sensor, motion.rate[:, k], motion.acceleration[:, k], motion.force[:, k], period
-        )
+        values = mounted_sensor_values(sensor, motion.rate[:, k], motion.acceleration[:, k], motion.force[:, k], period)
         for channel in sensor.channels(name):
             noise = Sensor(standard_deviation=sensor.noise(channel))
             values_of = _add_random_error(noise, channel, values[channel.partition(".")[0]], seed)
@@ -120,26 +119,29 @@ def mounted_sensor_values(
     return values
 
 
-def _simulate_scalar_readings(plant: Plant, sensors: SensorSet, truth: dict[str, np.ndarray], seed: int):
+def _simulate_scalar_readings(plant: Plant, sensors: SensorSet, truth: dict[str, np.ndarray], rows: int, seed: int):
     """Return the readings of flows, load-sensing pressure and pilot pressures, and their units."""
-    valves, values, units = plant.machine.valve_axes, {}, {}
+    valves, values = plant.machine.valve_axes, {}
     if sensors.flow:
         for axis in valves:
             values[f"flow.{axis}"] = sensors.flow, truth[f"truth.flow_head.{axis}"], "m^3/s"
     if sensors.pressure_ls and valves:
         fed = [
             np.where(truth[f"truth.spool.{a}"] > 0.0, truth[f"pressure_head.{a}"], truth[f"pressure_rod.{a}"])
-            * (np.abs(truth[f"command.{a}"]) > (valves[a].valve.deadband if valves[a].valve else 0.0))
-            for a in valves
+            * (np.abs(truth[f"command.{a}"]) > axis.valve.deadband)
+            for a, axis in valves.items()
+            if axis.valve
         ]
         values["pressure_ls"] = sensors.pressure_ls, np.max(fed, axis=0), "Pa"
     if sensors.pilot_pressure:
+        span = sensors.pilot_pressure.span or 0.0
         for axis in valves:
             for side, sign in (("a", 1.0), ("b", -1.0)):
-                pressure = sensors.pilot_pressure.span * np.clip(sign * truth[f"command.{axis}"], 0.0, 1.0)
+                pressure = span * np.clip(sign * truth[f"command.{axis}"], 0.0, 1.0)
                 values[f"pilot_pressure_{side}.{axis}"] = sensors.pilot_pressure, pressure, "Pa"
-    if sensors.oil_temperature and "oil_temperature" in truth:
-        values["oil_temperature"] = sensors.oil_temperature, truth["oil_temperature"], "degC"
+    if sensors.oil_temperature and plant.machine.oil:
+        temperature = np.full(rows, plant.machine.oil.temperature)
+        values["oil_temperature"] = sensors.oil_temperature, temperature, "degC"
     readings = {channel: _add_random_error(s, channel, v, seed) for channel, (s, v, _) in values.items()}
     return readings, {channel: unit for channel, (_, _, unit) in values.items()}
 

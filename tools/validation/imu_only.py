@@ -28,7 +28,7 @@ from tools.validation.blind.draw import draw_effect
 from tools.validation.blind.motions import RATE, motions
 
 POSITIONS = {"swing": [0.5, 0.3, 0.4], "boom": [2.5, 0.0, 0.9], "stick": [0.9, 0.1, 0.2]}  # m, in the link's frame
-GYRO_NOISE, ACCELEROMETER_NOISE = 0.003, 0.03  # rad/s and m/s^2 per reading at 50 Hz
+GYRO_NOISE, ACCELEROMETER_NOISE = 0.0012, 0.03  # rad/s and m/s^2 at 50 Hz: 0.014 deg/s and 0.6 mg per sqrt(Hz)
 ROTATION_SD, GYRO_BIAS_SD, ACCELEROMETER_BIAS_SD = np.radians(3.0), 0.005, 0.03  # of the drawn errors
 POSE_SD = np.radians(0.1)
 REST = 5.0  # s at rest at the start and at the end of each run
@@ -36,10 +36,10 @@ LIMIT = 0.3  # deg
 WITHOUT_MEANING = ("angle_", "length_", "clock_offset", "base_tilt", "link_length")  # joint sensors and geometry
 
 
-def write_machine(folder: Path, errors: dict[str, dict]) -> None:
+def write_machine(folder: Path, errors: dict[str, dict], gyro_noise: float) -> None:
     """Write a CAT 215 with IMUs; `errors` are further facts of each IMU."""
     mounted = {
-        f"{link}_imu": {"type": "imu", "link": link, "position": position, "gyro_noise": GYRO_NOISE,
+        f"{link}_imu": {"type": "imu", "link": link, "position": position, "gyro_noise": gyro_noise,
                         "accelerometer_noise": ACCELEROMETER_NOISE, **errors.get(link, {})}
         for link, position in POSITIONS.items()
     }  # fmt: skip
@@ -52,7 +52,9 @@ def write_machine(folder: Path, errors: dict[str, dict]) -> None:
     (folder / "machine.yaml").write_text(yaml.safe_dump(facts, sort_keys=False))
 
 
-def simulate(folder: Path, rng: np.random.Generator, effect: str | None) -> tuple[dict, dict[str, dict], list[str]]:
+def simulate(
+    folder: Path, rng: np.random.Generator, effect: str | None, gyro_noise: float
+) -> tuple[dict, dict[str, dict], list[str]]:
     """Write machines and logs of a trial; return its hidden effect, the true angles, and known poses."""
     errors = {
         link: {"rotation": rng.normal(0.0, ROTATION_SD, 3).tolist(),
@@ -60,8 +62,8 @@ def simulate(folder: Path, rng: np.random.Generator, effect: str | None) -> tupl
                "accelerometer_bias": rng.normal(0.0, ACCELEROMETER_BIAS_SD, 3).tolist()}
         for link in POSITIONS
     }  # fmt: skip
-    write_machine(folder / "true", errors)
-    write_machine(folder / "nominal", {})
+    write_machine(folder / "true", errors, gyro_noise)
+    write_machine(folder / "nominal", {}, gyro_noise)
     (folder / "logs").mkdir()
     nominal = load_machine("cat215")
     planted = draw_effect(nominal, rng)
@@ -77,7 +79,8 @@ def simulate(folder: Path, rng: np.random.Generator, effect: str | None) -> tupl
         count = len(next(iter(columns.values())))
         pilot = pilot.model_copy(update={"columns": columns, "time": tuple(np.arange(count) / RATE)})
         own = scenario.model_copy(update={
-            "machine": str(folder / "true"), "sensors": "imu", "pilot": pilot, "duration": count / RATE, "effects": (hidden,)})  # fmt: skip
+            "machine": str(folder / "true"), "sensors": "imu", "pilot": pilot, "duration": count / RATE,
+            "effects": (hidden,)})  # fmt: skip
         run = run_scenario(own)
         save_log(run.measured, folder / "logs" / f"{own.name}.parquet")
         truth[own.name] = {axis: run.truth[f"angle.{axis}"] for axis in POSITIONS}
@@ -95,12 +98,13 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--effect", choices=sorted(EFFECTS), help="hidden effect; default: drawn")
+    parser.add_argument("--gyro-noise", type=float, default=GYRO_NOISE, help="rad/s per reading at 50 Hz")
     parser.add_argument("--no-gap", action="store_true")
     arguments = parser.parse_args()
     errors, ratios, answers = [], [], []
     for trial in range(arguments.seed, arguments.seed + arguments.trials):
         folder = arguments.out.resolve() / f"{trial:04d}"
-        hidden, truth, poses = simulate(folder, np.random.default_rng(trial), arguments.effect)
+        hidden, truth, poses = simulate(folder, np.random.default_rng(trial), arguments.effect, arguments.gyro_noise)
         command = [sys.executable, "-m", "hydrotele"]
         calibrate = [*command, "calibrate", "imu", "--data", str(folder / "logs"), "--machine", str(folder / "nominal"),
                      "--out", str(folder / "calibrated"), "--json"]  # fmt: skip
@@ -125,7 +129,10 @@ def main() -> None:
         document = json.loads((folder / "gap" / "gap.json").read_text()) if not result.returncode else {}
         named = [f"{e['name']}({e['location']})" for e in document.get("effects", [])]
         answers.append(f"{hidden['name']}({hidden['location']})" in named)
-        print(f"  hidden {hidden}, named {', '.join(named) or result.stderr[-300:] or document.get('verdict')}", flush=True)
+        print(
+            f"  hidden {hidden}, named {', '.join(named) or result.stderr[-300:] or document.get('verdict')}",
+            flush=True,
+        )
     for axis in POSITIONS:
         rms, high = (np.array([e[k] for e in errors if e[0] == axis]) for k in (1, 2))
         print(f"{axis}: RMS error median {np.median(rms):.3f}, largest {rms.max():.3f} deg; largest error"
