@@ -1,6 +1,6 @@
 """Batch smoother: joint motion and IMU parameters that fit the readings of several runs best.
 
-The joint positions of a run are cubic splines with a knot every two rows. All spline coefficients,
+The joint positions of a run are cubic splines with a knot at every row. All spline coefficients,
 the mounting rotations and the biases are estimated together by Gauss-Newton steps. The normal
 equations are banded, with a border of parameters, and solved by a banded Cholesky factorisation.
 """
@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 from hydrotele.calibrate.imu_model import ImuChain, predict_imu_readings
 
-_ROWS_PER_KNOT = 2.0
+_ROWS_PER_KNOT = 1.0
 _ACCELERATION_SD = 20.0  # [rad/s^2] or [m/s^2], prior of joint accelerations; only determines rows without readings
 _CHUNK = 2000  # rows per block of the normal equations
 _MAX_STEPS = 40
@@ -75,7 +75,7 @@ class SmoothedRun(NamedTuple):
         motion: (3, a, n) joint positions, velocities and accelerations at the rows.
         noise: (a,) median standard deviation of a position due to the noise of the readings [rad] or [m].
         offset: (a,) median standard deviation of a position due to the parameters [rad] or [m].
-        residual_rms: (s, 2) RMS of the residuals of gyro and accelerometer, relative to their noise.
+        residual_rms: (s, 2) RMS of the residuals of gyro and accelerometer, relative to the stated noise.
     """
 
     name: str
@@ -134,7 +134,7 @@ def smooth_imus(
     """
     splines = [_make_spline(run.time) for run in runs]
     coefficients = [_interpolate_start(run.time, s, q) for run, s, q in zip(runs, splines, start, strict=True)]
-    parameters = mean.to_vector()
+    parameters, stated = mean.to_vector(), noise
     for _ in range(2):
         parameters, coefficients, normals = _minimise(
             chain, runs, splines, coefficients, parameters, mean, prior_sd, noise
@@ -149,7 +149,7 @@ def smooth_imus(
     results = []
     for k, (run, spline, solved) in enumerate(zip(runs, splines, coefficients, strict=True)):
         white, common = _position_deviations(spline, factors[k], normals[k].border, covariance, run.position.shape[0])
-        results.append(SmoothedRun(run.name, _evaluate(spline, solved), white, common, rms[k]))
+        results.append(SmoothedRun(run.name, _evaluate(spline, solved), white, common, rms[k] * noise / stated))
     deviations = mean.from_vector(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return SmoothedImus(mean.from_vector(parameters), deviations, tuple(results))
 
@@ -185,7 +185,7 @@ def _minimise(chain, runs, splines, coefficients, parameters, mean, prior_sd, no
 
 
 def _make_spline(time: np.ndarray) -> _Spline:
-    """Return the cubic B-spline of a run with a uniform knot distance of two median row distances."""
+    """Return the cubic B-spline of a run with a uniform knot distance of one median row distance."""
     step = _ROWS_PER_KNOT * float(np.median(np.diff(time)))
     place = (time - time[0]) / step
     count = int(np.floor(place[-1])) + 1

@@ -111,6 +111,11 @@ def _print_result(document: dict[str, Any]) -> None:
             text = f"{scale * one['value']:.3f} +- {scale * one['standard_deviation']:.3f}"
             cells.append(text if one["identifiable"] else f"{text} (not identifiable)")
         table.add_row(f"{name} [{unit}]", *cells)
+    for kind in ("gyro", "accelerometer"):
+        worst = (
+            max(run["relative_residual"][name][kind] for run in document["runs"].values()) for name in document["imus"]
+        )
+        table.add_row(f"residual RMS / noise, {kind}", *(f"{ratio:.2f}" for ratio in worst))
     stdout_console.print(table)
     table = make_table("derived joint positions: standard deviation", "run", "axis", "noise", "constant offset")
     for run, axes in document["runs"].items():

@@ -81,7 +81,7 @@ def simulate_retrofit_readings(
         for channel in sensor.channels(name):
             noise = Sensor(standard_deviation=sensor.noise(channel))
             values_of = _add_random_error(noise, channel, values[channel.partition(".")[0]], seed)
-            readings[channel] = _hold(values_of, sensor.rate, period)
+            readings[channel] = _hold_readings(values_of, sensor.rate, period)
             units[channel] = "rad/s" if channel.startswith("gyro") else "rad"
             if channel.startswith("accelerometer"):
                 units[channel] = "m/s^2"
@@ -153,7 +153,7 @@ def _add_random_error(sensor: Sensor, channel: str, values: np.ndarray, seed: in
     return quantise_readings(values + errors, *make_channel_converter(sensor, channel))
 
 
-def _hold(values: np.ndarray, rate: float | None, period: float) -> np.ndarray:
+def _hold_readings(values: np.ndarray, rate: float | None, period: float) -> np.ndarray:
     """Return values (n,) that change only when a sensor of this rate [Hz] has a new reading."""
     if rate is None or rate * period >= 1.0:
         return values
