@@ -8,6 +8,10 @@ The following is not identifiable from IMUs alone and comes from the machine fil
   accelerations of the lever arms, which are small, separate the two;
 - the position of a joint whose axis is vertical (slew), apart from its changes, and its mean rate,
   apart from intervals without a command of this axis.
+
+The smoother uses the readings up to 4 Hz. The relation between angular accelerations and sampled
+rates is not accurate enough above, and vibrations would falsify the lever-arm accelerations. The
+gyros add the faster part of the joint motion afterwards.
 """
 
 import dataclasses
@@ -18,10 +22,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from hydrotele.calibrate.imu_model import ImuChain, build_imu_chain, rotation_from_parameters
-from hydrotele.calibrate.imu_smoother import ImuParameters, ImuRun, SmoothedImus, smooth_imus
+from hydrotele.calibrate.imu_smoother import ImuParameters, ImuRun, SmoothedImus, SmoothedRun, smooth_imus
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log
@@ -36,7 +41,8 @@ _REST_TIME = 1.0  # [s] without a command after which a slew drive is at rest
 _REST_RATE_SD = 2e-3  # [rad/s], oscillation of a slew drive with closed valves after this time
 _START_SD = 1e-4  # [rad], of the arbitrary initial position of a vertical axis
 _VERTICAL_COSINE = 0.94  # cosine of the angle (20 deg) to gravity below which gravity determines a joint
-_SMOOTHING_TIME = 0.2  # [s], moving average of specific forces for the initial positions
+_GRAVITY_TIME = 4.0  # [s], time over which gravity corrects the initial positions, longer than accelerations last
+_MOTION_BANDWIDTH = 4.0  # [Hz], above that of hydraulic drives and below the vibrations of their oil columns and links
 _POSE = re.compile(r"(?:(?P<run>[^@\s]+)@)?(?P<time>[-+.\deE]+)\s+(?P<values>.+)")
 MAX_SD_RATIO = 0.7  # a parameter with a larger ratio of posterior to prior standard deviation is not identifiable
 
@@ -148,7 +154,13 @@ def calibrate_imus(
         runs.append(run)
         starts.append(start)
     mean, prior_sd, noise = _make_prior(chain, len(runs), slope_sd)
-    smoothed = smooth_imus(chain, runs, starts, mean, prior_sd, noise)
+    slow = [
+        run._replace(readings=np.array([[_low_pass(run.time, v) for v in imu] for imu in run.readings])) for run in runs
+    ]
+    smoothed = smooth_imus(chain, slow, starts, mean, prior_sd, noise, _relative_bandwidth(logs[0].time))
+    complete = (_add_vibration(chain, run, motion, smoothed.parameters, k)
+                for k, (run, motion) in enumerate(zip(runs, smoothed.runs, strict=True)))  # fmt: skip
+    smoothed = smoothed._replace(runs=tuple(complete))
     calibrated = _write_parameters(machine, chosen, chain, smoothed)
     derived = tuple(_add_positions(log, machine, chain, run.motion, measured)
                     for log, run in zip(logs, smoothed.runs, strict=True))  # fmt: skip
@@ -192,39 +204,101 @@ def _make_run(
 
 
 def _estimate_start(chain: ImuChain, run: ImuRun) -> np.ndarray:
-    """Return initial joint positions (a, n) from gravity, for vertical axes from integrated rates.
+    """Return initial joint positions (a, n): integrated rates, corrected slowly by the direction of gravity.
 
     Known positions, as of joint sensors and poses, are used where they exist.
     """
-    axes, count = run.position.shape
-    start = np.zeros((axes, count))
-    window = max(1, round(_SMOOTHING_TIME / float(np.median(np.diff(run.time)))))
-    for link in chain.links:
+    start = np.zeros(run.position.shape)
+    window = max(1, round(_GRAVITY_TIME / float(np.median(np.diff(run.time)))))
+    for index, link in enumerate(chain.links):
         if link.axis < 0 or link.joint is None:
             continue
         known = np.isfinite(run.position[link.axis])
         if known.mean() > 0.5:
             start[link.axis] = np.interp(run.time, run.time[known], run.position[link.axis][known])
             continue
-        index = next(i for i, own in enumerate(chain.links) if own is link)
-        imu = next(k for k, place in enumerate(chain.imu_links) if place == index or _is_fixed_to(chain, place, index))
+        imu = _imu_on_link(chain, index)
+        assert imu is not None
         axis = np.array(link.joint.axis)
         frame = Rotation.from_rotvec(chain.sensors[imu].rotation).as_matrix()
-        readings = np.array([_fill_gaps(run.time, values) for values in run.readings[imu]])
-        force = frame @ uniform_filter1d(readings[3:], window, axis=1, mode="nearest")
+        turned = _integrate_joint_rate(
+            chain, run, index, np.zeros((len(chain.imus), 9)), np.zeros((len(chain.imus), 3))
+        )
         up = _up_in_link(chain, link.parent, start)
         along = axis @ up
         if np.mean(np.abs(along)) > _VERTICAL_COSINE * np.linalg.norm(chain.gravity):
-            rate = axis @ frame @ readings[:3]
-            steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(run.time)
-            start[link.axis] = np.concatenate([[0.0], np.cumsum(steps)])
-            if known.any():
-                start[link.axis] += run.position[link.axis][known][0] - start[link.axis][known][0]
+            offset = run.position[link.axis][known][0] - turned[known][0] if known.any() else 0.0
         else:
+            force = frame @ run.readings[imu, 3:]
             sine = axis @ np.cross(force.T, up.T).T
             cosine = np.sum(force * up, axis=0) - (axis @ force) * along
-            start[link.axis] = np.unwrap(np.arctan2(sine, cosine))
+            parts = np.exp(1j * (np.arctan2(sine, cosine) - turned))
+            parts = np.array([_fill_gaps(run.time, part) for part in (parts.real, parts.imag)])
+            smooth = uniform_filter1d(parts, window, axis=1, mode="nearest")
+            offset = np.unwrap(np.arctan2(smooth[1], smooth[0]))
+        start[link.axis] = turned + offset
+        if known.any():
+            difference = run.position[link.axis][known][0] - start[link.axis][known][0]
+            start[link.axis] += 2.0 * np.pi * np.round(difference / (2.0 * np.pi))
     return start
+
+
+def _integrate_joint_rate(
+    chain: ImuChain, run: ImuRun, index: int, mounting: np.ndarray, bias: np.ndarray
+) -> np.ndarray:
+    """Return the integral (n,) of the rate of the joint of a link, from the gyros of the link and its parent.
+
+    The component of an angular rate along the joint axis is the same in the axes of both links.
+    """
+    rates = []
+    for place in (index, chain.links[index].parent):
+        imu = _imu_on_link(chain, place)
+        if imu is None:
+            continue
+        frame = Rotation.from_rotvec(chain.sensors[imu].rotation).as_matrix() @ rotation_from_parameters(
+            mounting[imu, :3]
+        )
+        joint = chain.links[index].joint
+        assert joint
+        rate = np.array(joint.axis) @ frame @ (run.readings[imu, :3] - bias[imu][:, None])
+        rates.append(_fill_gaps(run.time, rate))
+    relative = rates[0] - rates[1] if len(rates) == 2 else rates[0]
+    return np.concatenate([[0.0], np.cumsum(0.5 * (relative[1:] + relative[:-1]) * np.diff(run.time))])
+
+
+def _imu_on_link(chain: ImuChain, index: int) -> int | None:
+    """Return the index of an IMU on a link or fixed to it, or None; -1 is the fixed frame."""
+    if index < 0:
+        return None
+    return next((k for k, place in enumerate(chain.imu_links) if _is_fixed_to(chain, place, index)), None)
+
+
+def _relative_bandwidth(time: np.ndarray) -> float:
+    """Return the bandwidth of the smoother relative to half the row rate, at most 1."""
+    return min(1.0, 2.0 * _MOTION_BANDWIDTH * float(np.median(np.diff(time))))
+
+
+def _low_pass(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (n,) without the content above the bandwidth of the joint motion; NaN remains NaN."""
+    if (bandwidth := _relative_bandwidth(time)) == 1.0:
+        return values
+    sections = butter(4, bandwidth, output="sos")
+    return np.where(np.isfinite(values), sosfiltfilt(sections, _fill_gaps(time, values)), np.nan)
+
+
+def _add_vibration(
+    chain: ImuChain, run: ImuRun, smoothed: SmoothedRun, found: ImuParameters, place: int
+) -> SmoothedRun:
+    """Return the motion of a run with the content above the bandwidth of the smoother, from the gyros."""
+    motion = smoothed.motion.copy()
+    for index, link in enumerate(chain.links):
+        if link.axis < 0 or np.isfinite(run.position[link.axis]).mean() > 0.5:
+            continue
+        angle = _integrate_joint_rate(chain, run, index, found.mounting, found.gyro_bias[place])
+        fast = angle - _low_pass(run.time, angle)
+        motion[0, link.axis] += fast
+        motion[1, link.axis] += np.gradient(fast, run.time)
+    return smoothed._replace(motion=motion)
 
 
 def _fill_gaps(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -298,11 +372,11 @@ def _make_prior(chain: ImuChain, runs: int, slope_sd: float) -> tuple[ImuParamet
     sensors = chain.sensors
     count = len(sensors)
     mean = ImuParameters(
-        np.array([[0.0, 0.0, 0.0, *s.accelerometer_bias] for s in sensors]), np.zeros(2),
+        np.array([[0.0, 0.0, 0.0, *s.accelerometer_bias, 0.0, 0.0, 0.0] for s in sensors]), np.zeros(2),
         np.array([[s.gyro_bias for s in sensors]] * runs),
     )  # fmt: skip
     deviation = ImuParameters(
-        np.array([3 * [s.rotation_sd] + 3 * [s.accelerometer_bias_sd] for s in sensors]),
+        np.array([3 * [s.rotation_sd] + 3 * [s.accelerometer_bias_sd] + 3 * [s.position_sd] for s in sensors]),
         np.full(2, slope_sd), np.array([[3 * [s.gyro_bias_sd] for s in sensors]] * runs),
     )  # fmt: skip
     noise = [(s.gyro_noise or _GYRO_NOISE, s.accelerometer_noise or _ACCELEROMETER_NOISE) for s in sensors]
@@ -321,10 +395,12 @@ def _write_parameters(machine: Machine, name: str, chain: ImuChain, smoothed: Sm
         )
         mounted[imu] = stated.model_copy(update={
             "rotation": tuple(map(float, rotation.as_rotvec())),
-            "accelerometer_bias": tuple(map(float, found.mounting[k, 3:])),
+            "position": tuple(map(float, np.array(stated.position) + found.mounting[k, 6:])),
+            "position_sd": float(deviation.mounting[k, 6:].max()),
+            "accelerometer_bias": tuple(map(float, found.mounting[k, 3:6])),
             "gyro_bias": tuple(map(float, found.gyro_bias[:, k].mean(axis=0))),
             "rotation_sd": float(deviation.mounting[k, :3].max()),
-            "accelerometer_bias_sd": float(deviation.mounting[k, 3:].max()),
+            "accelerometer_bias_sd": float(deviation.mounting[k, 3:6].max()),
         })  # fmt: skip
     channels = dict(sensors.channels)
     for a, axis in enumerate(chain.axes):

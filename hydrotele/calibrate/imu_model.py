@@ -107,8 +107,9 @@ def predict_imu_readings(chain: ImuChain, motion: np.ndarray, mounting: np.ndarr
     Args:
         chain: the chain with a axes and s IMUs.
         motion: (3, a, n) joint positions [rad] or [m], velocities and accelerations.
-        mounting: (s, 6) rotation of each IMU relative to its stated rotation, as modified Rodrigues
-            parameters times 4 (a rotation vector [rad] if small), and accelerometer bias [m/s^2].
+        mounting: (s, 9) rotation of each IMU relative to its stated rotation, as modified Rodrigues
+            parameters times 4 (a rotation vector [rad] if small), accelerometer bias [m/s^2], and
+            position relative to the stated one [m].
         tilt: (2,) rotation of the machine about the world's x and y axes [rad]; 0 if it is level.
 
     Returns:
@@ -141,10 +142,10 @@ def predict_imu_readings(chain: ImuChain, motion: np.ndarray, mounting: np.ndarr
     readings = []
     for sensor, place, values in zip(chain.sensors, chain.imu_links, mounting, strict=True):
         rate, acceleration, force = states[place] if place >= 0 else still
-        arm = np.array(sensor.position)[:, None]
+        arm = (np.array(sensor.position) + values[6:])[:, None]
         force = force + _cross(acceleration, arm) + _cross(rate, _cross(rate, arm))
         axes = (Rotation.from_rotvec(sensor.rotation).as_matrix() @ rotation_from_parameters(values[:3])).T
-        readings.append(np.concatenate([axes @ rate, axes @ force + values[3:, None]]))
+        readings.append(np.concatenate([axes @ rate, axes @ force + values[3:6, None]]))
     return np.array(readings)
 
 

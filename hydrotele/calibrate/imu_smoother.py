@@ -1,6 +1,6 @@
 """Batch smoother: joint motion and IMU parameters that fit the readings of several runs best.
 
-The joint positions of a run are cubic splines with a knot at every row. All spline coefficients,
+The joint positions of a run are quintic splines with a knot at every row. All spline coefficients,
 the mounting rotations and the biases are estimated together by Gauss-Newton steps. The normal
 equations are banded, with a border of parameters, and solved by a banded Cholesky factorisation.
 """
@@ -8,15 +8,18 @@ equations are banded, with a border of parameters, and solved by a banded Choles
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from hydrotele.calibrate.imu_model import ImuChain, predict_imu_readings
 
-_ROWS_PER_KNOT = 1.0
+_DEGREE = 5  # of the splines; the accelerations of cubic splines are 1 to 2 % too large at a tenth of the row rate
 _ACCELERATION_SD = 20.0  # [rad/s^2] or [m/s^2], prior of joint accelerations; only determines rows without readings
 _CHUNK = 2000  # rows per block of the normal equations
 _MAX_STEPS = 40
 _MAX_HALVINGS = 6
+_MAX_REWEIGHTINGS = 2
+_MAX_EXCESS = 1.1  # ratio of residuals to their expected RMS, due to random scatter
 _CONVERGED = 1e-3  # decrease of the cost per step at which the iteration stops
 _COMPLEX_STEP = 1e-30
 
@@ -45,7 +48,8 @@ class ImuParameters(NamedTuple):
     """Parameters of s IMUs and r runs; also used for their standard deviations.
 
     Attributes:
-        mounting: (s, 6) rotation relative to the stated one [rad] and accelerometer bias [m/s^2].
+        mounting: (s, 9) rotation relative to the stated one [rad], accelerometer bias [m/s^2], and
+            position relative to the stated one [m].
         tilt: (2,) rotation of the machine about the world's x and y axes [rad].
         gyro_bias: (r, s, 3) [rad/s].
     """
@@ -94,7 +98,7 @@ class SmoothedImus(NamedTuple):
 
 
 class _Spline(NamedTuple):
-    """Cubic spline of a run: interval (n,) of each row, basis (3, n, 4) of value and derivatives."""
+    """Spline of a run: interval (n,) of each row, basis (3, n, 6) of value and derivatives."""
 
     interval: np.ndarray
     basis: np.ndarray
@@ -116,7 +120,7 @@ class _Normal(NamedTuple):
 
 def smooth_imus(
     chain: ImuChain, runs: list[ImuRun], start: list[np.ndarray], mean: ImuParameters, prior_sd: ImuParameters,
-    noise: np.ndarray,
+    noise: np.ndarray, bandwidth: float,
 ) -> SmoothedImus:  # fmt: skip
     """Estimate the joint motion of all runs and the parameters of the IMUs.
 
@@ -126,8 +130,10 @@ def smooth_imus(
         start: (a, n) initial joint positions of each run.
         mean: prior mean of the parameters.
         prior_sd: prior standard deviations; a parameter with 0 is not estimated.
-        noise: (s, 2) standard deviations of gyro [rad/s] and accelerometer [m/s^2]. If the
-            residuals of a sensor are larger, the fit is repeated with the RMS of its residuals.
+        noise: (s, 2) standard deviations of gyro [rad/s] and accelerometer [m/s^2] before the
+            low-pass filter. If the residuals of a sensor in a run are larger than they should be,
+            because of vibrations, the fit is repeated with a noise increased in proportion.
+        bandwidth: bandwidth of the filtered readings relative to half the row rate.
 
     Returns:
         The estimates. Their standard deviations assume white noise.
@@ -135,21 +141,25 @@ def smooth_imus(
     splines = [_make_spline(run.time) for run in runs]
     coefficients = [_interpolate_start(run.time, s, q) for run, s, q in zip(runs, splines, start, strict=True)]
     parameters, stated = mean.to_vector(), noise
-    for _ in range(2):
+    noise = np.repeat(stated[None], len(runs), axis=0)
+    for _ in range(_MAX_REWEIGHTINGS + 1):
         parameters, coefficients, normals = _minimise(
             chain, runs, splines, coefficients, parameters, mean, prior_sd, noise
         )
         rms = _residual_rms(runs, normals)
-        weights = np.array([np.isfinite(run.readings).sum() for run in runs], float)
-        pooled = np.sqrt(np.einsum("r,rsk->sk", weights, rms**2) / weights.sum())
-        if np.all(pooled <= 1.05):
+        excess = rms / np.sqrt(bandwidth)
+        if np.all(excess <= _MAX_EXCESS):
             break
-        noise = noise * np.maximum(pooled, 1.0)
+        noise = np.maximum(noise * excess, stated)
     covariance, _, factors = _reduce(normals, parameters, mean.to_vector(), prior_sd.to_vector())
     results = []
     for k, (run, spline, solved) in enumerate(zip(runs, splines, coefficients, strict=True)):
         white, common = _position_deviations(spline, factors[k], normals[k].border, covariance, run.position.shape[0])
-        results.append(SmoothedRun(run.name, _evaluate(spline, solved), white, common, rms[k] * noise / stated))
+        results.append(
+            SmoothedRun(
+                run.name, _evaluate(spline, solved), white, common, rms[k] * noise[k] / stated / np.sqrt(bandwidth)
+            )
+        )
     deviations = mean.from_vector(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return SmoothedImus(mean.from_vector(parameters), deviations, tuple(results))
 
@@ -159,7 +169,7 @@ def _minimise(chain, runs, splines, coefficients, parameters, mean, prior_sd, no
     center, sd = mean.to_vector(), prior_sd.to_vector()
 
     def assemble(c, p):
-        normals = [_assemble(chain, run, k, spline, own, mean.from_vector(p), noise)
+        normals = [_assemble(chain, run, k, spline, own, mean.from_vector(p), noise[k])
                    for k, (run, spline, own) in enumerate(zip(runs, splines, c, strict=True))]  # fmt: skip
         free = sd > 0.0
         return normals, sum(n.cost for n in normals) + np.sum(((p - center)[free] / sd[free]) ** 2)
@@ -185,31 +195,26 @@ def _minimise(chain, runs, splines, coefficients, parameters, mean, prior_sd, no
 
 
 def _make_spline(time: np.ndarray) -> _Spline:
-    """Return the cubic B-spline of a run with a uniform knot distance of one median row distance."""
-    step = _ROWS_PER_KNOT * float(np.median(np.diff(time)))
+    """Return the B-spline of a run with a uniform knot distance of one median row distance."""
+    step = float(np.median(np.diff(time)))
     place = (time - time[0]) / step
     count = int(np.floor(place[-1])) + 1
     interval = np.minimum(place.astype(int), count - 1)
-    u = place - interval
-    one = np.ones_like(u)
-    basis = np.array([
-        [(1 - u) ** 3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (-3 * u**3 + 3 * u**2 + 3 * u + 1) / 6, u**3 / 6],
-        [-((1 - u) ** 2) / 2, (9 * u**2 - 12 * u) / 6, (-9 * u**2 + 6 * u + 3 * one) / 6, u**2 / 2],
-        [1 - u, 3 * u - 2, 1 - 3 * u, u],
-    ])  # fmt: skip
-    scaled = basis * (step ** -np.arange(3.0))[:, None, None]
-    return _Spline(interval, scaled.transpose(0, 2, 1), count + 3, step)
+    element = BSpline.basis_element(np.arange(_DEGREE + 2.0), extrapolate=False)
+    points = (place - interval)[:, None] + _DEGREE - np.arange(_DEGREE + 1)
+    basis = [np.nan_to_num(element.derivative(d)(points) if d else element(points)) / step**d for d in range(3)]
+    return _Spline(interval, np.array(basis), count + _DEGREE, step)
 
 
 def _interpolate_start(time: np.ndarray, spline: _Spline, positions: np.ndarray) -> np.ndarray:
     """Return coefficients (c, a) of a spline close to the positions (a, n)."""
-    knots = time[0] + spline.step * (np.arange(spline.count) - 1)
+    knots = time[0] + spline.step * (np.arange(spline.count) - _DEGREE // 2)
     return np.array([np.interp(knots, time, q) for q in positions]).T
 
 
 def _evaluate(spline: _Spline, coefficients: np.ndarray) -> np.ndarray:
     """Return positions, velocities and accelerations (3, a, n) of a spline with coefficients (c, a)."""
-    local = coefficients[spline.interval[:, None] + np.arange(4)]
+    local = coefficients[spline.interval[:, None] + np.arange(_DEGREE + 1)]
     return np.einsum("dnk,nka->dan", spline.basis, local)
 
 
@@ -220,7 +225,7 @@ def _assemble(
     axes, imus = coefficients.shape[1], len(chain.imus)
     motion = _evaluate(spline, coefficients)
     size = parameters.to_vector().size
-    intervals, width = spline.count - 3, 4 * axes
+    intervals, width = spline.count - _DEGREE, (_DEGREE + 1) * axes
     hessian, border = np.zeros((intervals, width, width)), np.zeros((intervals, width, size))
     gradient, corner, corner_gradient = np.zeros((intervals, width)), np.zeros((size, size)), np.zeros(size)
     cost, squares = 0.0, np.zeros((imus, 2))
@@ -287,17 +292,17 @@ def _linearise(chain, run: ImuRun, place: int, motion, parameters: ImuParameters
             moved = motion.astype(complex)
             moved[d, a] += 1j * _COMPLEX_STEP
             by_motion[d, : 6 * imus, :, a] = derivative(moved, parameters.mounting, parameters.tilt).reshape(-1, count)
-    for k in range(6):
+    for k in range(9):
         mounting = parameters.mounting.astype(complex)
         mounting[:, k] += 1j * _COMPLEX_STEP
         change = derivative(motion, mounting, parameters.tilt)
         for i in range(imus):
-            by_parameter[6 * i : 6 * i + 6, :, 6 * i + k] = change[i]
+            by_parameter[6 * i : 6 * i + 6, :, 9 * i + k] = change[i]
     for k in range(2):
         tilt = parameters.tilt.astype(complex)
         tilt[k] += 1j * _COMPLEX_STEP
-        by_parameter[: 6 * imus, :, 6 * imus + k] = derivative(motion, parameters.mounting, tilt).reshape(-1, count)
-    first = 6 * imus + 2 + 3 * imus * place
+        by_parameter[: 6 * imus, :, 9 * imus + k] = derivative(motion, parameters.mounting, tilt).reshape(-1, count)
+    first = 9 * imus + 2 + 3 * imus * place
     for i in range(imus):
         for k in range(3):
             by_parameter[6 * i + k, :, first + 3 * i + k] = weight[i, k]
@@ -350,7 +355,7 @@ def _position_deviations(spline: _Spline, factor, border, covariance, axes: int)
     for place, row in enumerate(rows):
         unit = np.zeros((spline.count * axes, axes))
         for a in range(axes):
-            unit[(spline.interval[row] + np.arange(4)) * axes + a, a] = spline.basis[0, row]
+            unit[(spline.interval[row] + np.arange(_DEGREE + 1)) * axes + a, a] = spline.basis[0, row]
         solved = cho_solve_banded((factor, True), unit)
         white[place] = np.einsum("ca,ca->a", unit, solved)
         by_parameter = border.T @ solved

@@ -16,7 +16,8 @@ from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_mach
 
 _KIND = "imu calibration"  # kind of the output folder
 _PARAMETERS = (
-    *(f"rotation_{c}" for c in "xyz"), *(f"accelerometer_bias_{c}" for c in "xyz"), *(f"gyro_bias_{c}" for c in "xyz")
+    *(f"rotation_{c}" for c in "xyz"), *(f"accelerometer_bias_{c}" for c in "xyz"), *(f"position_{c}" for c in "xyz"),
+    *(f"gyro_bias_{c}" for c in "xyz"),
 )  # fmt: skip
 
 
@@ -103,6 +104,8 @@ def _print_result(document: dict[str, Any]) -> None:
     table = make_table("IMUs: value +- standard deviation", "parameter", *document["imus"])
     for name in _PARAMETERS:
         scale, unit = (np.degrees(1.0), "deg") if name.startswith("rotation") else (1.0, "m/s²")
+        if name.startswith("position"):
+            scale, unit = 1e3, "mm"
         if name.startswith("gyro"):
             scale, unit = np.degrees(1.0), "deg/s"
         cells = []

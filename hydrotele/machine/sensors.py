@@ -66,8 +66,9 @@ class MountedSensor(StrictModel):
     `gyro_noise` [rad/s], `accelerometer_noise` [m/s^2] and `angle_noise` [rad] are standard
     deviations of one reading. A sensor with a `rate` [Hz] holds its reading between updates. The
     biases are added to readings; `angle_bias` is that of all angles of the sensor. `calibrate imu`
-    uses the standard deviations `rotation_sd` [rad], `gyro_bias_sd` and `accelerometer_bias_sd` of
-    the stated values. Their defaults are those of a sensor mounted by eye, and of a MEMS sensor.
+    uses the standard deviations `rotation_sd` [rad], `position_sd` [m], `gyro_bias_sd` and
+    `accelerometer_bias_sd` of the stated values. Their defaults are those of a sensor mounted by
+    eye, with its position measured by a tape, and of a MEMS sensor.
     """
 
     type: Literal["imu", "gyro", "inclination", "tilt"] = "imu"
@@ -83,6 +84,7 @@ class MountedSensor(StrictModel):
     time_constant: NonNegativeFloat = 0.0
     rate: PositiveFloat | None = None
     rotation_sd: PositiveFloat = 0.1
+    position_sd: PositiveFloat = 0.02
     gyro_bias_sd: PositiveFloat = 0.01
     accelerometer_bias_sd: PositiveFloat = 0.05
 

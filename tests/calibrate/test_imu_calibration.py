@@ -45,7 +45,7 @@ def simulated_log(machine, rng, path):
     motion = joint_motion(time)
     sensors = machine.sensors["imu"].mounted
     chain = build_imu_chain(machine, sensors, [])
-    mounting = np.array([[0.0, 0.0, 0.0, *s.accelerometer_bias] for s in chain.sensors])
+    mounting = np.array([[0.0, 0.0, 0.0, *s.accelerometer_bias, 0.0, 0.0, 0.0] for s in chain.sensors])
     readings = predict_imu_readings(chain, motion, mounting, np.zeros(2))
     columns, units = {}, {}
     for axis in chain.axes:

@@ -34,7 +34,7 @@ def test_imu_readings_of_mujoco_agree_with_the_chain_model():
     record = Record(np.arange(rows) * 0.02, **states, act=empty, command=empty, contact=empty, contact_of={}, tip=empty,
                     delayed_readings=empty)  # fmt: skip
     found = compute_link_motion(plant.model, record, [plant.model.body(name).id for name in sensors])
-    expected = predict_imu_readings(chain, motion, np.zeros((3, 6)), np.zeros(2))
+    expected = predict_imu_readings(chain, motion, np.zeros((3, 9)), np.zeros(2))
     for k, sensor in enumerate(chain.sensors):
         values = mounted_sensor_values(sensor, found.rate[:, k], found.acceleration[:, k], found.force[:, k], 0.02)
         kinds = [f"{kind}_{c}" for kind in ("gyro", "accelerometer") for c in "xyz"]
@@ -47,7 +47,7 @@ def test_inclination_is_the_sum_of_the_joint_angles_at_rest():
                                       "w": MountedSensor(link="swing")}, [])  # fmt: skip
     motion = np.zeros((3, 3, 1))
     motion[0, :, 0] = 0.3, 0.4, -1.0
-    force = predict_imu_readings(chain, motion, np.zeros((3, 6)), np.zeros(2))[0, 3:].T
+    force = predict_imu_readings(chain, motion, np.zeros((3, 9)), np.zeros(2))[0, 3:].T
     still = np.zeros((1, 3))
     values = mounted_sensor_values(MountedSensor(type="inclination", link="stick"), still, still, force, 0.02)
     assert values["inclination"][0] == pytest.approx(0.4 - 1.0)
