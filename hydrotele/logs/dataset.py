@@ -27,7 +27,8 @@ from hydrotele.logs.run_files import RunFiles, check_commands, read_runs
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.log_columns import LogColumn
 from hydrotele.machine.machine import IDEAL_SENSORS, Machine, find_channel_sensor, get_sensor_set, reading_noise_rms
-from hydrotele.machine.oil import kinematic_viscosity, with_oil_temperature
+from hydrotele.machine.oil import kinematic_viscosity
+from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.machine.sensors import SensorSet
 
 _MIN_MOTION_RATIO = 10.0  # noise standard deviations that a position range must exceed to count as motion

@@ -1,15 +1,11 @@
-"""Oil of a machine: viscosity as a function of temperature, and friction and leakage that follow it."""
+"""Oil of a machine: its viscosity as a function of temperature."""
 
 import math
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import Field, model_validator
 
 from hydrotele.core.datafile import PositiveFloat, StrictModel
-from hydrotele.core.errors import InputError
-
-if TYPE_CHECKING:
-    from hydrotele.machine.machine import Machine
 
 _ZERO_CELSIUS = 273.15  # K
 _WALTHER_OFFSET = 0.7  # mm^2/s
@@ -55,27 +51,3 @@ def kinematic_viscosity(oil: Oil, temperature: float) -> float:
     thick, thin = double_log(oil.viscosity_40), double_log(oil.viscosity_100)
     share = (math.log10(temperature + _ZERO_CELSIUS) - low) / (high - low)
     return 1e-6 * (10.0**10.0 ** (thick + share * (thin - thick)) - _WALTHER_OFFSET)
-
-
-def with_oil_temperature(machine: "Machine", temperature: float) -> "Machine":
-    """Return the machine with its oil at a temperature [degC].
-
-    Viscous friction of hydraulic drives is proportional to the viscosity, laminar leakage inversely
-    proportional. The difference in density (1.4 % per 20 K) is neglected.
-
-    Raises:
-        InputError: the machine file has no `oil`, or the temperature is out of range.
-    """
-    if machine.oil is None:
-        message = "has no oil: add `oil: {temperature: 40}`, the temperature at which its friction holds [degC]"
-        raise InputError(f"machine {machine.name}", message)
-    if not MIN_TEMPERATURE <= temperature <= MAX_TEMPERATURE:
-        message = f"{temperature:g} degC is outside {MIN_TEMPERATURE:g} .. {MAX_TEMPERATURE:g} degC"
-        raise InputError("oil temperature", message)
-    ratio = kinematic_viscosity(machine.oil, temperature) / kinematic_viscosity(machine.oil, machine.oil.temperature)
-    for name, axis in machine.hydraulic_axes.items():
-        drive = axis.hydraulic_drive
-        part = f"axes.{name}.{'cylinder' if axis.cylinder else 'motor'}"
-        machine = machine.replace(f"{part}.friction.viscous", ratio * drive.friction.viscous, validate=False)
-        machine = machine.replace(f"{part}.leakage", drive.leakage / ratio, validate=False)
-    return machine.replace("oil.temperature", temperature)

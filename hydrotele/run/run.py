@@ -29,7 +29,7 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.oil import with_oil_temperature
+from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.run.session import PreparedRun, Session
 from hydrotele.run.tick_loop import (
     start_background_compilation,

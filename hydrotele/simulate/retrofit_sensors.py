@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from hydrotele.machine.sensors import MountedSensor, Sensor, SensorSet, make_channel_converter
@@ -111,6 +110,8 @@ def mounted_sensor_values(
         "pitch": np.arctan2(-x, np.hypot(y, z)),
     }
     if sensor.time_constant and period:
+        from scipy.signal import lfilter  # starts slowly
+
         kept = np.exp(-period / sensor.time_constant)
         angles = {n: lfilter([1 - kept], [1, -kept], v, zi=[kept * v[0]])[0] for n, v in angles.items()}
     values = {name: angle + sensor.angle_bias for name, angle in angles.items()}

@@ -5,9 +5,11 @@ import pytest
 
 from hydrotele.calibrate.imu_model import build_imu_chain, predict_imu_readings
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.oil import Oil, kinematic_viscosity, with_oil_temperature
+from hydrotele.machine.oil import Oil, kinematic_viscosity
+from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.machine.sensors import MountedSensor
 from hydrotele.run.run import run_scenario
+from hydrotele.scenario.pilots import ConstantPilot
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant
 from hydrotele.simulate.record import Record
@@ -78,7 +80,7 @@ def test_run_writes_the_sensors_of_the_set(tmp_path):
     (tmp_path / "machine.yaml").write_text(MACHINE)
     run = run_scenario(Scenario(
         name="site", machine=str(tmp_path), sensors="site", duration=2.0, control_rate=50.0, ground=False,
-        oil_temperature=60.0, pilot={"kind": "constant", "commands": {"boom": -0.4, "swing": 0.3}}))  # fmt: skip
+        oil_temperature=60.0, pilot=ConstantPilot(kind="constant", commands={"boom": -0.4, "swing": 0.3})))  # fmt: skip
     log, truth = run.measured, run.truth
     assert not any(c.startswith(("angle", "length")) for c in log.columns)
     assert "angle.boom" in truth
@@ -90,7 +92,7 @@ def test_run_writes_the_sensors_of_the_set(tmp_path):
     assert np.max(log["pressure_ls"]) > 1e6
     held = log["gyro_z.slew"].reshape(-1, 5)  # 10 Hz in rows of 50 Hz
     assert np.all(held == held[:, :1])
-    viscous = {m.axes["boom"].cylinder.friction.viscous for m in (run.plant.machine, load_machine("cat215"))}
+    viscous = {m.axes["boom"].hydraulic_drive.friction.viscous for m in (run.plant.machine, load_machine("cat215"))}
     assert min(viscous) / max(viscous) == pytest.approx(kinematic_viscosity(Oil(), 60.0) / 46e-6)
 
 
@@ -100,7 +102,7 @@ def test_viscosity_follows_walther_and_is_reversible():
     machine = load_machine("cat215").replace("oil", oil)
     warm = with_oil_temperature(machine, 60.0)
     ratio = kinematic_viscosity(oil, 60.0) / kinematic_viscosity(oil, 40.0)
-    assert warm.axes["boom"].cylinder.friction.viscous == pytest.approx(ratio * 6000.0)
-    assert warm.axes["boom"].cylinder.leakage == pytest.approx(2e-12 / ratio)
+    assert warm.axes["boom"].hydraulic_drive.friction.viscous == pytest.approx(ratio * 6000.0)
+    assert warm.axes["boom"].hydraulic_drive.leakage == pytest.approx(2e-12 / ratio)
     back = with_oil_temperature(warm, 40.0)
-    assert back.axes["boom"].cylinder.friction.viscous == pytest.approx(6000.0)
+    assert back.axes["boom"].hydraulic_drive.friction.viscous == pytest.approx(6000.0)
