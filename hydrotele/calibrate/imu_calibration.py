@@ -25,7 +25,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from hydrotele.calibrate.imu_model import ImuChain, build_imu_chain, rotation_from_parameters
+from hydrotele.calibrate.imu_model import ImuChain, build_imu_chain, predict_imu_readings, rotation_from_parameters
 from hydrotele.calibrate.imu_smoother import ImuParameters, ImuRun, SmoothedImus, SmoothedRun, smooth_imus
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
@@ -42,6 +42,7 @@ _REST_RATE_SD = 2e-3  # [rad/s], oscillation of a slew drive with closed valves 
 _START_SD = 1e-4  # [rad], of the arbitrary initial position of a vertical axis
 _VERTICAL_COSINE = 0.94  # cosine of the angle (20 deg) to gravity below which gravity determines a joint
 _GRAVITY_TIME = 4.0  # [s], time over which gravity corrects the initial positions, longer than accelerations last
+_RELATIVE_ERROR = 0.02  # of accelerations of links: scale and cross-axis error of MEMS accelerometers, flexible links
 _MOTION_BANDWIDTH = 4.0  # [Hz], above that of hydraulic drives and below the vibrations of their oil columns and links
 _POSE = re.compile(r"(?:(?P<run>[^@\s]+)@)?(?P<time>[-+.\deE]+)\s+(?P<values>.+)")
 MAX_SD_RATIO = 0.7  # a parameter with a larger ratio of posterior to prior standard deviation is not identifiable
@@ -153,10 +154,8 @@ def calibrate_imus(
         notes += _add_rest(run, log, machine, chain, vertical, start)
         runs.append(run)
         starts.append(start)
+    slow = [_filter_run(chain, run, start) for run, start in zip(runs, starts, strict=True)]
     mean, prior_sd, noise = _make_prior(chain, len(runs), slope_sd)
-    slow = [
-        run._replace(readings=np.array([[_low_pass(run.time, v) for v in imu] for imu in run.readings])) for run in runs
-    ]
     smoothed = smooth_imus(chain, slow, starts, mean, prior_sd, noise, _relative_bandwidth(logs[0].time))
     complete = (_add_vibration(chain, run, motion, smoothed.parameters, k)
                 for k, (run, motion) in enumerate(zip(runs, smoothed.runs, strict=True)))  # fmt: skip
@@ -200,7 +199,8 @@ def _make_run(
             for axis, value in pose.positions.items():
                 position[chain.axes.index(axis), row] = value
                 deviation[chain.axes.index(axis), row] = pose.standard_deviation
-    return ImuRun(name, log.time, np.array(readings), position, deviation, np.full((axes, count), np.inf))
+    still, exact = np.full((axes, count), np.inf), np.zeros((len(readings), count))
+    return ImuRun(name, log.time, np.array(readings), position, deviation, still, exact)
 
 
 def _estimate_start(chain: ImuChain, run: ImuRun) -> np.ndarray:
@@ -232,8 +232,8 @@ def _estimate_start(chain: ImuChain, run: ImuRun) -> np.ndarray:
             force = frame @ run.readings[imu, 3:]
             sine = axis @ np.cross(force.T, up.T).T
             cosine = np.sum(force * up, axis=0) - (axis @ force) * along
-            parts = np.exp(1j * (np.arctan2(sine, cosine) - turned))
-            parts = np.array([_fill_gaps(run.time, part) for part in (parts.real, parts.imag)])
+            angle = np.arctan2(sine, cosine) - turned
+            parts = np.array([_fill_gaps(run.time, part) for part in (np.cos(angle), np.sin(angle))])
             smooth = uniform_filter1d(parts, window, axis=1, mode="nearest")
             offset = np.unwrap(np.arctan2(smooth[1], smooth[0]))
         start[link.axis] = turned + offset
@@ -271,6 +271,22 @@ def _imu_on_link(chain: ImuChain, index: int) -> int | None:
     if index < 0:
         return None
     return next((k for k, place in enumerate(chain.imu_links) if _is_fixed_to(chain, place, index)), None)
+
+
+def _filter_run(chain: ImuChain, run: ImuRun, start: np.ndarray) -> ImuRun:
+    """Return a run with low-pass filtered readings, and the errors of the accelerometers in motion.
+
+    The error is proportional to the accelerations of the links, which follow from the initial joint positions (a, n).
+    """
+    slow = [_low_pass(run.time, q) for q in start]
+    rates = [np.gradient(q, run.time) for q in slow]
+    motion = np.array([slow, rates, [np.gradient(v, run.time) for v in rates]])
+    still = motion * np.array([1.0, 0.0, 0.0])[:, None, None]
+    stated = np.zeros((len(chain.imus), 9)), np.zeros(2)
+    moving = predict_imu_readings(chain, motion, *stated) - predict_imu_readings(chain, still, *stated)
+    error = _RELATIVE_ERROR * np.linalg.norm(moving[:, 3:], axis=1)
+    readings = np.array([[_low_pass(run.time, v) for v in imu] for imu in run.readings])
+    return run._replace(readings=readings, accelerometer_error=error)
 
 
 def _relative_bandwidth(time: np.ndarray) -> float:

@@ -34,6 +34,7 @@ class ImuRun(NamedTuple):
         position: (a, n) known joint positions [rad] or [m]; NaN where unknown.
         position_sd: (a, n) their standard deviations.
         rest_rate_sd: (a, n) standard deviation of the joint rate around 0 at rest; inf in motion.
+        accelerometer_error: (s, n) standard deviation of errors in addition to the noise [m/s^2].
     """
 
     name: str
@@ -42,6 +43,7 @@ class ImuRun(NamedTuple):
     position: np.ndarray
     position_sd: np.ndarray
     rest_rate_sd: np.ndarray
+    accelerometer_error: np.ndarray
 
 
 class ImuParameters(NamedTuple):
@@ -276,7 +278,9 @@ def _linearise(chain, run: ImuRun, place: int, motion, parameters: ImuParameters
     imus = len(chain.imus)
     readings = run.readings[:, :, rows]
     bias = parameters.gyro_bias[place]
-    weight = np.repeat(1.0 / noise, 3, axis=1)[:, :, None] * np.isfinite(readings)
+    sd = np.repeat(noise, 3, axis=1)[:, :, None] * np.ones_like(readings)
+    sd[:, 3:] = np.hypot(sd[:, 3:], run.accelerometer_error[:, None, rows])
+    weight = np.isfinite(readings) / sd
     prediction = predict_imu_readings(chain, motion, parameters.mounting, parameters.tilt)
     prediction[:, :3] += bias[:, :, None]
     by_motion = np.zeros((3, 6 * imus + 2 * axes, count, axes))

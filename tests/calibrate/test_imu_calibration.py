@@ -1,6 +1,7 @@
 """IMUs: mounting, biases and joint angles from readings that are computed from known joint motion."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +21,11 @@ def machine_with_imus(rng=None):
     """Return a CAT 215 with an IMU on each link; with a generator, mounted with errors."""
     sensors = {}
     for link, position in POSITIONS.items():
-        errors = {} if rng is None else {
+        errors: dict[str, Any] = {} if rng is None else {
             "rotation": tuple(rng.normal(0.0, 0.05, 3)), "gyro_bias": tuple(rng.normal(0.0, 0.005, 3)),
             "accelerometer_bias": tuple(rng.normal(0.0, 0.03, 3)),
         }  # fmt: skip
-        sensors[f"{link}_imu"] = MountedSensor(link=link, position=position, **NOISE, **errors)
+        sensors[f"{link}_imu"] = MountedSensor(link=link, position=position, **{**NOISE, **errors})
     return load_machine("cat215").replace("sensors", {"imu": SensorSet(absent=("angle", "length"), mounted=sensors)})
 
 
