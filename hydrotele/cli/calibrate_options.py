@@ -92,6 +92,40 @@ def machine(
     calibrate_machine(data, dynamics or [], machine, heldout, out, json)
 
 
+@app.command(
+    epilog="Examples:  hydrotele calibrate imu --data logs --machine excavator --pose '2.0 boom=25deg stick=-90deg'"
+    " --out calibrated   |   hydrotele gap --data calibrated/logs --machine calibrated/machine.yaml"
+)
+def imu(
+    data: Annotated[list[Path], typer.Option("--data", "-d", help="Log with IMU channels, or folder. Repeatable.")],
+    machine: Annotated[str, typer.Option("--machine", "-m", help="Machine with IMUs: shipped name or folder.")],
+    tool: Annotated[str | None, typer.Option("--tool", "-t", help="Tool; default: that of the machine.")] = None,
+    sensors: Annotated[
+        str | None, typer.Option("--sensors", "-s", help="Sensor set with the IMUs; default: that of the logs.")
+    ] = None,
+    pose: Annotated[
+        list[str] | None,
+        typer.Option(help="Known joint positions at a time: '[RUN@]SECONDS AXIS=VALUE[deg] ...'. Repeatable."),
+    ] = None,
+    pose_sd_deg: Annotated[float, typer.Option(min=1e-4, help="Standard deviation of --pose [deg].")] = 0.1,
+    slope_sd_deg: Annotated[
+        float, typer.Option(min=0.0, max=45.0, help="Standard deviation of the ground's slope [deg]; 0: level.")
+    ] = 0.0,
+    out: OutOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate IMUs on the links from logs, and derive the joint positions from their readings.
+
+    Mounting rotations, biases and the joint motion are estimated together. A constant offset of a
+    joint equals a rotation of its IMU about the joint axis, so give known positions with --pose, or
+    a small rotation_sd in the machine file. The folder --out contains the calibrated machine and
+    the logs with joint positions, which gap, identify, compare and replay accept.
+    """
+    from hydrotele.cli.calibrate_imu_command import calibrate_imu_logs
+
+    calibrate_imu_logs(data, machine, tool, sensors, pose or [], pose_sd_deg, slope_sd_deg, out, json)
+
+
 @app.command(epilog="Example:  hydrotele calibrate design --out design")
 def design(
     out: OutOption = None, json: JsonOption = False, machine: MachineOption = "calibrator",

@@ -32,6 +32,7 @@ OUTPUT_FILES = {
                           "calibrated.urdf"),
     "arm calibration": ("calibration.json", "report.html", "machine.yaml"),
     "linkage calibration": ("calibration.json", "report.html", "machine.yaml"),
+    "imu calibration": ("calibration.json", "machine.*", "machine_assets/*", "logs/*.parquet"),
     "calibrator design": ("calibration.json", "design.png"),
     "machine calibration": ("calibration.json", "identify.json", "report.html", "kinematics/*",
                             "identified/machine.*", "identified/machine_assets/*"),

@@ -22,6 +22,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "mm/s": ("m/s", 1e-3),
     "cm/s": ("m/s", 1e-2),
     "mm/s^2": ("m/s^2", 1e-3),
+    "g0": ("m/s^2", 9.80665),
     "psi": ("Pa", PSI),
     "bar": ("Pa", 1e5),
     "mbar": ("Pa", 1e2),
@@ -57,10 +58,10 @@ _SPELLINGS = {
     "-": "1", "sec": "s", "seconds": "s", "volt": "V", "µs": "us", "s^-1": "1/s",
     "Nm": "N m", "N*m": "N m", "N.m": "N m", "kNm": "kN m", "kN*m": "kN m", "m3/s": "m^3/s",
     "rad/s2": "rad/s^2", "deg/s2": "deg/s^2", "m/s2": "m/s^2", "°": "deg", "°/s": "deg/s",
-    "l/min": "L/min", "lpm": "L/min", "degree": "deg", "degrees": "deg", "percent": "%",
+    "l/min": "L/min", "lpm": "L/min", "degree": "deg", "degrees": "deg", "percent": "%", "°C": "degC",
 }  # fmt: skip
 
-_SI_UNITS = frozenset({si for si, _ in UNITS.values()} | {"mA"})
+_SI_UNITS = frozenset({si for si, _ in UNITS.values()} | {"mA", "degC"})
 
 KEY_SUFFIXES: Mapping[str, str] = {
     "_deg": "deg", "_mm": "mm", "_in2": "in^2", "_cm2": "cm^2", "_psi": "psi", "_bar": "bar",

@@ -27,6 +27,8 @@ from hydrotele.logs.run_files import RunFiles, check_commands, read_runs
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.log_columns import LogColumn
 from hydrotele.machine.machine import IDEAL_SENSORS, Machine, find_channel_sensor, get_sensor_set, reading_noise_rms
+from hydrotele.machine.oil import kinematic_viscosity
+from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.machine.sensors import SensorSet
 
 _MIN_MOTION_RATIO = 10.0  # noise standard deviations that a position range must exceed to count as motion
@@ -550,6 +552,8 @@ def make_dataset(
     axes, channels = tuple(actuator_order(machine)), channels_predicted_and_logged(files, machine)
     check_mask_runs(masks, [run.name for run in files])
     known, notes = determine_sensors(files, machine, sensors)
+    machine, warm = _set_logged_oil_temperature(files, machine)
+    notes += warm
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
     merged = merge_runs(files, machine, masks)
     runs, short = _remove_short_runs(merged)
@@ -590,6 +594,22 @@ def make_dataset(
     notes += left
     return Dataset(machine, axes, channels, noise[kept], tuple(made.values()), judge, tuple(notes),
                    next((n for n, s in machine.sensors.items() if s is known), None), unused)  # fmt: skip
+
+
+def _set_logged_oil_temperature(files: Sequence[RunFiles], machine: Machine) -> tuple[Machine, list[str]]:
+    """Return the machine at the median oil temperature of all runs, and notes; unchanged without oil or temperature."""
+    medians = {run.name: float(np.nanmedian(log["oil_temperature"])) for run in files for log in run.logs
+               if "oil_temperature" in log and np.isfinite(log["oil_temperature"]).any()}  # fmt: skip
+    if machine.oil is None or not medians:
+        return machine, []
+    low, high = min(medians, key=medians.__getitem__), max(medians, key=medians.__getitem__)
+    temperature = float(np.median(list(medians.values())))
+    ratio = kinematic_viscosity(machine.oil, medians[low]) / kinematic_viscosity(machine.oil, medians[high])
+    text = f"the oil temperature of all runs is set to {temperature:.1f} degC, the median of the logs."
+    if ratio > 1.0:
+        text += (f" It is {medians[low]:.1f} degC in {low} and {medians[high]:.1f} degC in {high}; viscous friction"
+                 f" differs by the factor {ratio:.2f} between them.")  # fmt: skip
+    return with_oil_temperature(machine, temperature), [text]
 
 
 class MergedRuns(NamedTuple):

@@ -66,6 +66,17 @@ MEASURED_KINDS: Mapping[str, ChannelKind] = {
     "pressure_head": ChannelKind(("Pa",), "head side chamber, or port A of a motor"),
     "pressure_rod": ChannelKind(("Pa",), "rod side chamber, or port B of a motor"),
     "pressure_supply": ChannelKind(("Pa",), "pump or supply pressure", "none"),
+    "pressure_ls": ChannelKind(("Pa",), "load-sensing pressure: the highest pressure of a fed chamber", "none"),
+    "pilot_pressure_a": ChannelKind(("Pa",), "pilot pressure for positive commands of an axis"),
+    "pilot_pressure_b": ChannelKind(("Pa",), "pilot pressure for negative commands of an axis"),
+    "flow": ChannelKind(("m^3/s",), "measured flow into the head side or port A of an axis"),
+    "oil_temperature": ChannelKind(("degC",), "temperature of the oil in the tank", "none"),
+    "engine_speed": ChannelKind(("rad/s",), "speed of the engine that drives the pumps", "none"),
+    **{f"gyro_{c}": ChannelKind(("rad/s",), f"angular rate about the {c} axis of a sensor") for c in "xyz"},
+    **{f"accelerometer_{c}": ChannelKind(("m/s^2",), f"specific force along the {c} axis of a sensor") for c in "xyz"},
+    "inclination": ChannelKind(("rad",), "angle of the x axis of a sensor above the horizontal"),
+    "roll": ChannelKind(("rad",), "rotation of a sensor about its x axis, against gravity"),
+    "pitch": ChannelKind(("rad",), "rotation of a sensor about its y axis, against gravity"),
     "speed": ChannelKind(("rad/s",), "speed of a pump, with the sign of the side that it feeds"),
     "speed_reference": ChannelKind(("rad/s",), "pump speed reference of the controller"),
     "current": ChannelKind(("A", "1"), "motor current, or uncalibrated converter counts"),
@@ -129,8 +140,8 @@ def plausible_magnitude_limits(name: str, unit: str, *, stated: bool = True) -> 
     """
     if unit == "1" and name.startswith("command."):
         return _COMMAND_LIMITS
-    if name.startswith(("speed.", "speed_reference.", "truth.speed.")):
-        return _NO_LIMITS  # a pump turns faster than any joint
+    if name.startswith(("speed.", "speed_reference.", "truth.speed.", "engine_speed", "pilot_pressure")):
+        return _NO_LIMITS  # an engine turns faster than any joint; pilot pressures may stay at 0
     return _LIMITS_OF_UNIT.get(unit, (_NO_LIMITS, _NO_LIMITS))[0 if stated else 1]
 
 

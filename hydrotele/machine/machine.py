@@ -23,6 +23,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import describe_excess
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
 from hydrotele.machine.log_columns import LogColumnEntry
+from hydrotele.machine.oil import Oil
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet, make_channel_converter
 from hydrotele.terms.term import Term
 
@@ -199,6 +200,7 @@ class Machine(StrictModel):
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
     loads: dict[Name, LoadCylinder] = {}
+    oil: Oil | None = None
     sensors: dict[Name, SensorSet] = {}
     sensor_errors: dict[str, SensorError] = {}
     home: dict[Name, float] = {}
@@ -364,6 +366,8 @@ class Machine(StrictModel):
                 _check_name_is_known(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
+            for mounted, sensor in sensors.mounted.items():
+                _check_name_is_known(sensor.link, known, f"sensors.{name}.mounted.{mounted}.link")
             for channel in sensors.channels:
                 _check_name_is_known(channel, self.sensed_channels, f"sensors.{name}.channels")
         for name, axis in self.axes.items():

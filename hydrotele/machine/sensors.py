@@ -4,16 +4,18 @@ Random error, converter steps, systematic errors, warming drift and first-order 
 """
 
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.datafile import (
+    Name,
     NonNegativeFloat,
     PositiveFloat,
     StrictModel,
+    Vector,
 )
 
 
@@ -42,8 +44,69 @@ class Sensor(StrictModel):
         return self.standard_deviation or self.accuracy / math.sqrt(3.0)
 
 
+MOUNTED_KINDS = {
+    "imu": (*(f"gyro_{c}" for c in "xyz"), *(f"accelerometer_{c}" for c in "xyz")),
+    "gyro": ("gyro_z",),
+    "inclination": ("inclination",),
+    "tilt": ("roll", "pitch"),
+}
+"""Type of a mounted sensor -> kinds of its channels."""
+
+
+class MountedSensor(StrictModel):
+    """A sensor mounted on a link: an IMU, a gyro about its z axis, or an inclination or tilt sensor.
+
+    `link` may be `world` for the chassis. `position` [m] is in the frame of the link. `rotation`
+    [rad] is the rotation vector that rotates the axes of the link into those of the sensor. An IMU
+    measures angular rate and specific force in its axes; at rest the specific force points up and
+    has the size of gravity. An inclination sensor measures the angle of its x axis above the
+    horizontal in its x-z plane. A tilt sensor measures roll about its x axis and pitch about its y
+    axis. Both compute the angle from the specific force and filter it with `time_constant` [s].
+
+    `gyro_noise` [rad/s], `accelerometer_noise` [m/s^2] and `angle_noise` [rad] are standard
+    deviations of one reading. A sensor with a `rate` [Hz] holds its reading between updates. The
+    biases are added to readings; `angle_bias` is that of all angles of the sensor. `calibrate imu`
+    uses the standard deviations `rotation_sd` [rad], `position_sd` [m], `gyro_bias_sd` and
+    `accelerometer_bias_sd` of the stated values. Their defaults are those of a sensor mounted by
+    eye, with its position measured by a tape, and of a MEMS sensor.
+    """
+
+    type: Literal["imu", "gyro", "inclination", "tilt"] = "imu"
+    link: Name
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+    gyro_noise: NonNegativeFloat = 0.0
+    accelerometer_noise: NonNegativeFloat = 0.0
+    angle_noise: NonNegativeFloat = 0.0
+    gyro_bias: Vector = (0.0, 0.0, 0.0)
+    accelerometer_bias: Vector = (0.0, 0.0, 0.0)
+    angle_bias: float = 0.0
+    time_constant: NonNegativeFloat = 0.0
+    rate: PositiveFloat | None = None
+    rotation_sd: PositiveFloat = 0.1
+    position_sd: PositiveFloat = 0.02
+    gyro_bias_sd: PositiveFloat = 0.01
+    accelerometer_bias_sd: PositiveFloat = 0.05
+
+    def channels(self, name: str) -> tuple[str, ...]:
+        """Return the names of the channels of this sensor, which has the name `name`."""
+        return tuple(f"{kind}.{name}" for kind in MOUNTED_KINDS[self.type])
+
+    def noise(self, channel: str) -> float:
+        """Return the standard deviation of one reading of a channel [channel's unit]."""
+        if channel.startswith("gyro"):
+            return self.gyro_noise
+        return self.accelerometer_noise if channel.startswith("accelerometer") else self.angle_noise
+
+
 class SensorSet(StrictModel):
     """Sensors of a machine by kind of channel, sampled at `rate` [Hz].
+
+    `absent` are the kinds that the machine does not have; they are not logged. Retrofitted sensors
+    are logged if the set contains them: `mounted` are those on links, by name; `flow` measures the
+    valve flow into the head side of each axis, `pressure_ls` the highest pressure of a fed chamber,
+    `oil_temperature` [degC] that of the tank, and `pilot_pressure` the two pilot pressures of each
+    axis, which rise to `span` at full command.
 
     The sampling instants of the rows have a normally distributed error with standard deviation
     `jitter` [s], common to all channels. An entry of `channels`, such as `pressure_head.boom`,
@@ -57,9 +120,17 @@ class SensorSet(StrictModel):
     length: Sensor = Sensor()
     pressure: Sensor = Sensor()
     channels: dict[str, Sensor] = {}
+    absent: tuple[Literal["angle", "position", "length", "pressure"], ...] = ()
+    mounted: dict[Name, MountedSensor] = {}
+    flow: Sensor | None = None
+    pressure_ls: Sensor | None = None
+    pilot_pressure: Sensor | None = None
+    oil_temperature: Sensor | None = None
 
     @model_validator(mode="after")
     def _check(self):
+        if self.pilot_pressure and self.pilot_pressure.span is None:
+            raise ValueError("pilot_pressure: give span, the pilot pressure at full command")
         kinds = {kind: getattr(self, kind) for kind in ("angle", "position", "pressure")}
         others = {n: s for n, s in self.channels.items() if not n.startswith("length.")}
         for name, sensor in (kinds | others).items():

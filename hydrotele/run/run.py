@@ -29,6 +29,7 @@ from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
+from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.run.session import PreparedRun, Session
 from hydrotele.run.tick_loop import (
     start_background_compilation,
@@ -39,6 +40,7 @@ from hydrotele.simulate.conservation_checks import compute_balance_errors
 from hydrotele.simulate.mechanism import axes_with_transmission
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import Record
+from hydrotele.simulate.retrofit_sensors import simulate_retrofit_readings
 from hydrotele.simulate.sensor_models import Feedback, create_feedback, simulate_readings
 from hydrotele.simulate.stepping import delayed_commands
 from hydrotele.simulate.true_values import delayed_channels, true_channels
@@ -230,6 +232,8 @@ def prepare_run(scenario: Scenario) -> PreparedRun:
     """
     nominal = load_nominal_machine(scenario)
     machine = add_scenario_effects(nominal, scenario)
+    if scenario.oil_temperature is not None:
+        machine = with_oil_temperature(machine, scenario.oil_temperature)
     sensors = get_sensor_set(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
     data, start = _initial_data(plant, scenario)
@@ -357,6 +361,10 @@ def _make_logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback)
     visible |= delayed_channels(plant, record)
     readings |= simulate_readings(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
     units = {c: units[c] for c in readings}
+    if sensors:
+        readings = {c: v for c, v in readings.items() if not c.startswith(sensors.absent)}
+        added, added_units = simulate_retrofit_readings(plant, sensors, record, values, scenario.seed)
+        readings, units = readings | added, {c: units[c] for c in readings} | added_units
     return truth, _make_log(scenario, machine, record.time, readings, units, scenario.sensors)
 
 

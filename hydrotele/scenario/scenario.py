@@ -26,6 +26,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, resolve_path, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.log_channels import parse_channel
+from hydrotele.machine.oil import Temperature
 from hydrotele.scenario.pilots import Pilot, Pose, TablePilot, check_size_limit
 from hydrotele.scenario.surrounding_objects import SurroundingObject
 from hydrotele.scenario.teleoperation import TeleopPilot
@@ -85,7 +86,8 @@ class Scenario(StrictModel):
 
     `duration` [s] is that of the run, `timestep` [s] that of the physics. `control_rate` and `log_rate`
     [Hz] are the rates of controller and log, and `seed` is the seed of all random numbers. `sensors`
-    names a sensor set of the machine, and `tool` one of the machine's tools. `folder` is the folder of
+    names a sensor set of the machine, and `tool` one of the machine's tools. `oil_temperature` [degC]
+    is that during the run; the default is that of the machine's `oil`. `folder` is the folder of
     the scenario file, which is set automatically; relative paths in the scenario start there.
     """
 
@@ -105,6 +107,7 @@ class Scenario(StrictModel):
     pilot: Pilot
     servo: Servo = Servo()
     effects: tuple[PlantedEffect, ...] = ()
+    oil_temperature: Temperature | None = None
     folder: str = ""
 
     @model_validator(mode="after")

@@ -67,7 +67,7 @@ def quantise_reading(value, step, low, high):
 
 
 @compiled
-def _quantise_readings(values, step, low, high):
+def quantise_readings(values, step, low, high):
     """Round (n,) values to converter steps and clip them to the range `low` to `high` (`quantise_reading`)."""
     readings = np.empty(len(values))
     for row in range(len(values)):
@@ -150,7 +150,7 @@ def simulate_readings(
             error = (errors or {}).get(channel)
             if error is None:
                 error = sample_sensor_errors(sensor, seed, channel, len(values))
-            values = _quantise_readings(values + error, *make_channel_converter(sensor, channel))
+            values = quantise_readings(values + error, *make_channel_converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
 

@@ -13,8 +13,8 @@ from hydrotele.machine.sensors import Sensor, make_channel_converter
 from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.sensor_models import (
-    _quantise_readings,
     create_feedback,
+    quantise_readings,
     sample_sensor_errors,
     simulate_readings,
 )
@@ -105,11 +105,11 @@ def test_longer_run_begins_like_the_shorter_one():
 def test_converter_ends_and_goes_round():
     """Lengths and pressures end at 0 and the span; an angle goes on."""
     sensor, values = Sensor(bits=4, span=1.6), np.array([-0.3, 0.04, 0.06, 0.149, 9.0])
-    clipped = _quantise_readings(values, *make_channel_converter(sensor, "pressure_rod.boom"))
+    clipped = quantise_readings(values, *make_channel_converter(sensor, "pressure_rod.boom"))
     np.testing.assert_allclose(clipped, [0, 0, 0.1, 0.1, 1.6], atol=1e-15)
-    free = _quantise_readings(values, *make_channel_converter(sensor, "angle.boom"))
+    free = quantise_readings(values, *make_channel_converter(sensor, "angle.boom"))
     np.testing.assert_allclose(free, [-0.3, 0, 0.1, 0.1, 9], atol=1e-15)
-    assert np.array_equal(_quantise_readings(values, *make_channel_converter(Sensor(), "length.boom")), values)
+    assert np.array_equal(quantise_readings(values, *make_channel_converter(Sensor(), "length.boom")), values)
     machine = load_machine("cat215")
     readings = simulate_readings(
         machine, get_sensor_set(machine, "khoshzaban1992"), 1,
