@@ -503,7 +503,7 @@ def run_balances(machine: Machine, data: Dataset, run: RunData, noise: np.ndarra
 
 
 def pump_lack(
-    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray, name: str
+    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray, name: str = "supply"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the flow that a pump of valves gives beyond the model's, where it is short.
 

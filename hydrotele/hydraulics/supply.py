@@ -210,7 +210,7 @@ def group_size(user, first, count, k):
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        k: index of the axis, counted from the first hydraulic actuator.
+        k: index of the axis, counted from the first hydraulic actuator [1].
 
     Returns:
         Number of axes, scalar.
@@ -343,9 +343,19 @@ def _solve_lines(user, first, count, scratch, factor, with_power):
 
 @compile_without_allocation
 def write_delivered_fractions(user, first, count, act, scratch):
-    """Write the fraction of its maximum flow that every pump delivers to FRACTION of `scratch`.
+    """Write the fraction of its maximum flow that every pump delivers to FRACTION of the work space.
 
-    Arguments are those of `delivered_flow_fraction` and the work space (SCRATCH_SIZE,).
+    Args:
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        act: (>= 4 count,) activations, and the states of pumps with a time constant [1].
+        scratch: (SCRATCH_SIZE,) work space.
+
+    Returns:
+        Nothing.
+
+    Source: `delivered_flow_fraction`.
     """
     k = 0
     while k < count:
@@ -361,7 +371,8 @@ def solve_state_supplies(user, first, count, act, scratch):
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        act: (>= 4 count,) activations, and the states of pumps with a time constant.
+        act: (>= 4 count,) activations: spools [1], pressures [Pa], and the states of pumps with a
+            time constant [1].
         scratch: (SCRATCH_SIZE,) work space; written as by `solve_supply_pressures`.
 
     Returns:

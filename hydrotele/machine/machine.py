@@ -239,9 +239,10 @@ class Machine(StrictModel):
     unused tools. `supply` is the pump and the oil; with several pumps, `supplies` are the pumps by
     name, `merging` the merging valves by the axis that shifts them, and `supply` the oil and the
     values that the pumps share. `engine` limits the power of all pumps. `sensed_joints` are the
-    joints with the angle sensors of a calibrator, starting at the machine. `home` are the joint positions at home [rad] or [m]. `loads` are the load cylinders
-    of pump axes. `log_columns` maps columns of log files to channels. `uncertainty` are standard
-    deviations of parameters by name. `terms` are additional force, flow and command laws.
+    joints with the angle sensors of a calibrator, starting at the machine. `home` are the joint
+    positions at home [rad] or [m]. `loads` are the load cylinders of pump axes. `log_columns` maps
+    columns of log files to channels. `uncertainty` are standard deviations of parameters by name.
+    `terms` are additional force, flow and command laws.
     """
 
     name: Name
