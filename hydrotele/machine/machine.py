@@ -467,7 +467,7 @@ class Machine(StrictModel):
         if self.valve_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
-            raise ValueError("a machine can have at most 8 hydraulic axes")
+            raise ValueError("a machine can have at most 8 valves and axes with their own pump")
         _check_pumps(self)
         return self
 
