@@ -11,6 +11,7 @@ from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, 
 from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, Slot
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.machine.drives import EndStop
+from hydrotele.machine.machine import Engine
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
@@ -170,13 +171,15 @@ def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
         assert beyond(nominal), "without the effect it would be seen"
 
 
-def test_two_pumps_with_merging_priority_and_engine(reduced_of):
+def test_two_pumps_with_merging_priority_and_engine(reduced_of, tmp_path):
     """At full commands, so that pumps and engine limit the flows."""
-    folder = Path(__file__).parents[1] / "data" / "two_pumps"
-    machine = load_machine(folder)
-    plan = scenario("cat215/none", machine.axes, (), 1.25e-4, 1.0).model_copy(update={"machine": str(folder)})
+    two = load_machine(Path(__file__).parents[1] / "data" / "two_pumps")
+    machine = two.model_copy(update={"engine": Engine(power=60e3)})
+    save_machine(machine, tmp_path / "machine.yaml")
+    plan = scenario("cat215/none", machine.axes, (), 1.25e-4, 1.0).model_copy(update={"machine": str(tmp_path)})
     assert not beyond(differences(reduced_of, machine, plan, 40))
-    assert beyond(differences(reduced_of, machine.model_copy(update={"merging": {}}), plan, 40))
+    for without in ({"merging": {}}, {"engine": None}):
+        assert beyond(differences(reduced_of, machine.model_copy(update=without), plan, 40))
 
 
 def run_into(phase):

@@ -10,6 +10,7 @@ from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.hydraulics.actuator_layout import actuator_order, actuator_parameters
 from hydrotele.hydraulics.circuit import FEED, Slot, circuit_scratch, solve_state_supplies
 from hydrotele.hydraulics.supply import LINE_FLOW
+from hydrotele.machine.machine import Engine
 from hydrotele.machine.machine_file import load_machine, save_machine
 from tools.validation.two_pumps import equal_pump_errors, priority_errors, steady_state_errors
 
@@ -45,20 +46,19 @@ ACT = [1.0, 0, 9e6, 4e6, 0.6, 0, 8e6, 6e6, -0.7, 0, 5e6, 7e6]  # boom, swing, st
 
 
 def test_engine_limits_the_power_of_all_pumps():
-    free, _ = supplies(TWO.model_copy(update={"engine": None}), ACT)
-    limited = TWO.replace("engine.power", 20e3)
-    fed, scratch = supplies(limited, ACT)
+    free, _ = supplies(TWO, ACT)
+    fed, scratch = supplies(TWO.model_copy(update={"engine": Engine(power=25e3, efficiency=0.8)}), ACT)
     power = scratch[LINE_FLOW] * fed["boom"] + scratch[LINE_FLOW + 1] * fed["swing"]
     assert power == pytest.approx(20e3, rel=1e-12)
     assert all(fed[axis] < free[axis] for axis in fed)
-    assert supplies(TWO.replace("engine.power", 1e9), ACT)[0] == free
+    assert supplies(TWO.model_copy(update={"engine": Engine(power=1e9)}), ACT)[0] == free
 
 
 def test_merging_moves_its_share():
     """At full travel of the boom the front line has 1.7 and the rear line 0.3 of a pump's flow."""
-    _, scratch = supplies(TWO.model_copy(update={"engine": None}), ACT)
+    _, scratch = supplies(TWO, ACT)
     assert scratch[LINE_FLOW : LINE_FLOW + 2] == pytest.approx([1.7 * 2.5e-3, 0.3 * 2.5e-3], rel=1e-12)
-    stuck = apply_effect(TWO.model_copy(update={"engine": None}), "merging_valve", "boom", {"scale": 0.0})
+    stuck = apply_effect(TWO, "merging_valve", "boom", {"scale": 0.0})
     assert supplies(stuck, ACT)[1][LINE_FLOW] == 2.5e-3
 
 
@@ -74,9 +74,10 @@ def test_axes_of_a_pump_follow_one_another_and_priority_comes_first():
 
 
 def test_saved_machine_is_the_same(tmp_path):
-    save_machine(TWO, tmp_path / "machine.yaml")
+    saved = TWO.model_copy(update={"engine": Engine(power=75e3)})
+    save_machine(saved, tmp_path / "machine.yaml")
     loaded = load_machine(tmp_path / "machine.yaml")
-    assert (loaded.pumps, loaded.merging, loaded.engine) == (TWO.pumps, TWO.merging, TWO.engine)
+    assert (loaded.pumps, loaded.merging, loaded.engine) == (saved.pumps, saved.merging, saved.engine)
 
 
 @pytest.mark.parametrize(
