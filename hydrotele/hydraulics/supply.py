@@ -38,7 +38,7 @@ _DROP = int(Slot.COMPENSATED_DROP)
 _GROUP, _PRIORITY, _POWER = int(Slot.GROUP_SIZE), int(Slot.PRIORITY_DROP), int(Slot.ENGINE_POWER)
 _FROM, _TO, _MERGE = int(Slot.MERGE_FROM), int(Slot.MERGE_TO), int(Slot.MERGE_CURVE)
 _MAX_POWER_STEPS = 60
-_POWER_TOLERANCE = 1.0e-13  # of the flow factor at the engine limit: rounding errors
+_POWER_TOLERANCE = 1.0e-12  # of power and flow factor at the engine limit: that of the flow balance
 
 MAX_AXES = 8
 # Layout of the work space: ports of all axes; factors of pressures and supply coupling; the
@@ -263,8 +263,9 @@ def solve_supply_pressures(user, first, count, scratch):
 
     Without an engine limit every line is solved by `circuit_supply_pressure`. If the hydraulic
     power of all pumps at these pressures exceeds the limit, the flows of all pumps are multiplied
-    by the factor at which the power equals the limit. The power increases with the factor; it is
-    found by the Illinois method.
+    by the factor at which the power equals the limit. The power increases with the factor. The
+    logarithm of the factor is found by the Illinois method from that of the power, because the
+    power of flows through orifices is nearly a power law.
 
     Args:
         user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
@@ -285,16 +286,22 @@ def solve_supply_pressures(user, first, count, scratch):
     power = _solve_lines(user, first, count, scratch, 1.0, limit > 0.0)
     if limit == 0.0 or power <= limit:
         return power
-    low, high, below, above, factor = 0.0, 1.0, -limit, power - limit, 1.0
+    low, high, below, above, side, factor = -math.inf, 0.0, 0.0, math.log(power / limit), 0, 1.0
     for _ in range(_MAX_POWER_STEPS):
-        factor = low - below * (high - low) / (above - below)
+        guess = high - above if below == 0.0 else low - below * (high - low) / (above - below)
+        factor = math.exp(guess)
         power = _solve_lines(user, first, count, scratch, factor, True)
-        if power > limit:
-            high, above, below = factor, power - limit, 0.5 * below
-        else:
-            low, below, above = factor, power - limit, 0.5 * above
-        if abs(power - limit) <= _POWER_TOLERANCE * limit or high - low <= _POWER_TOLERANCE:
+        excess = math.log(power / limit)
+        if abs(excess) <= _POWER_TOLERANCE or high - low <= _POWER_TOLERANCE:
             break
+        if excess > 0.0:
+            high, above = guess, excess
+            below *= 0.5 if side > 0 else 1.0
+            side = 1
+        else:
+            low, below = guess, excess
+            above *= 0.5 if side < 0 else 1.0
+            side = -1
     k = 0
     while k < count:
         scratch[LINE_FLOW + k] *= factor
