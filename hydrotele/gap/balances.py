@@ -287,7 +287,7 @@ def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping
     told = noise or {}
     for k, (name, values) in enumerate(log.columns.items()):
         channel = parse_channel(name)
-        if channel.truth or (channel.axis and channel.axis not in machine.axes):
+        if channel.truth or (channel.axis and channel.axis not in {*machine.axes, *machine.supplies}):
             continue
         on_clock = np.full(rows, np.nan)
         on_clock[clock.tick] = values[clock.row]
