@@ -164,10 +164,11 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
 @compiled
 def _solve_row(user, spools, pressures, period, act, ports):
     """Write a row's activations and supplies; slow pumps have followed over a period, 0 at first."""
-    count, i = len(spools), 0
+    count = len(spools)
     for i in range(count):
         act[4 * i] = spools[i]
         act[4 * i + 2], act[4 * i + 3] = pressures[i]
+    i = 0
     compute_inlet_conditions(user, act, act, ports, 0, count, 0.0, act)
     write_demanded_fractions(user, 0, count, ports)
     while i < count:

@@ -42,12 +42,12 @@ from hydrotele.hydraulics.pump_drive import (
     pump_speed_step,
 )
 from hydrotele.hydraulics.supply import (
+    BLOCK_SIZE,
     DEMAND,
     FACTOR_OFFSET,
     FEED,
     FRACTION,
     IS_COUPLED,
-    LINE_DROOP,
     MAX_AXES,
     PUMP_ADDED,
     PUMP_START,
@@ -58,7 +58,6 @@ from hydrotele.hydraulics.supply import (
     advance_pump_flow_fraction,
     circuit_supply_pressure,
     compute_inlet_conditions,
-    compute_supply_pressure_derivatives,
     delivered_flow_fraction,
     group_size,
     pump_flow_fraction,
@@ -67,6 +66,7 @@ from hydrotele.hydraulics.supply import (
     solve_supply_pressures,
     write_delivered_fractions,
     write_demanded_fractions,
+    write_supply_couplings,
 )
 from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
 from hydrotele.terms.drive_state import VARIABLES, DriveState
@@ -291,13 +291,8 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
     if extra_states >= 0:
         write_delivered_fractions(user, first, count, act, scratch)
     solve_supply_pressures(user, first, count, scratch)
-    p_start, k = scratch[FEED], 0
-    while k < count:
-        size, f = group_size(user, first, count, k), FACTOR_OFFSET + 4 * k
-        scratch[IS_COUPLED + k] = compute_supply_pressure_derivatives(
-            user, first + k, size, scratch[4 * k :], scratch[FEED + k :], scratch[LINE_DROOP + k], scratch[f:]
-        )
-        k += size
+    p_start = scratch[FEED]
+    write_supply_couplings(user, first, count, scratch)
     if extra_states >= 0:
         _advance_pump_fractions(user, first, drives, terms, time, scratch, dt)
     for i in range(count):
@@ -320,7 +315,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
     k = 0
     while k < count:
-        size = group_size(user, first, count, k)
+        size = int(scratch[BLOCK_SIZE + k])
         if scratch[IS_COUPLED + k] > 0.0:
             _prepare_supply_coupling(user, first, k, size, drives, dt, gamma_h, scratch)
             _apply_supply_coupling(k, size, act_dot, scratch)
@@ -353,7 +348,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
     k = 0
     while k < count:
-        size = group_size(user, first, count, k)
+        size = int(scratch[BLOCK_SIZE + k])
         if scratch[IS_COUPLED + k] > 0.0:
             _apply_supply_coupling(k, size, act_dot, scratch)
         k += size

@@ -56,7 +56,8 @@ DEMAND = 16 * MAX_AXES  # fraction of each pump's flow that the valves demand [1
 PUMP_START = 17 * MAX_AXES  # demand at the start of a step [1]
 PUMP_ADDED = 18 * MAX_AXES  # flow fraction that terms add to each pump [1]
 IS_COUPLED = 19 * MAX_AXES  # whether a line couples the pressures of its axes
-SCRATCH_SIZE = 20 * MAX_AXES
+BLOCK_SIZE = 20 * MAX_AXES  # number of axes that are coupled with each other, at the first of them
+SCRATCH_SIZE = 21 * MAX_AXES
 
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _ADDED, _OVERRIDE = int(Slot.ADDED_DELIVERY), int(Slot.RELIEF_OVERRIDE)
@@ -619,7 +620,46 @@ def circuit_supply_pressure(user, first, count, ports, flow, droop):
 
 
 @compile_without_allocation
-def compute_supply_pressure_derivatives(user, first, count, ports, feed, droop, out):
+def write_supply_couplings(user, first, count, scratch):
+    """Write the derivatives of all supply pressures, and which axes they couple, to the work space.
+
+    The axes of a pump are one block, or two if the supply of its first axis is higher because of
+    its priority.
+
+    Args:
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `actuator_layout.Slot`.
+        first: index of the first hydraulic actuator.
+        count: number of hydraulic actuators.
+        scratch: (SCRATCH_SIZE,) work space after `solve_supply_pressures`. Written at the first axis of
+            each block: BLOCK_SIZE and IS_COUPLED; at FACTOR_OFFSET the derivatives of
+            `compute_supply_pressure_derivatives`.
+
+    Returns:
+        Nothing.
+
+    Source: `compute_supply_pressure_derivatives`.
+    """
+    k = 0
+    while k < count:
+        end = k + group_size(user, first, count, k)
+        droop = scratch[LINE_DROOP + k]
+        if scratch[FEED + k] > scratch[FEED + end - 1]:
+            f = FACTOR_OFFSET + 4 * k
+            scratch[BLOCK_SIZE + k] = 1.0
+            scratch[IS_COUPLED + k] = compute_supply_pressure_derivatives(
+                user, first + k, 1, scratch[4 * k :], scratch[FEED + k], 0.0, scratch[f:]
+            )
+            k += 1
+        f = FACTOR_OFFSET + 4 * k
+        scratch[BLOCK_SIZE + k] = end - k
+        scratch[IS_COUPLED + k] = compute_supply_pressure_derivatives(
+            user, first + k, end - k, scratch[4 * k :], scratch[FEED + k], droop, scratch[f:]
+        )
+        k = end
+
+
+@compile_without_allocation
+def compute_supply_pressure_derivatives(user, first, count, ports, supply, droop, out):
     """Write the derivatives of the supply pressure by the pressures of the fed chambers to `out`.
 
     `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` if the pump flow limits the pressure. It is 1 for the
@@ -634,8 +674,7 @@ def compute_supply_pressure_derivatives(user, first, count, ports, feed, droop, 
         ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], pressure of the fed chamber [Pa],
             pressure drop set by the compensator [Pa] and opening [1] of every axis, see
             `compute_inlet_conditions`.
-        feed: (>= count,) pressures that feed the axes [Pa]: p_s for all axes, or a higher one for an
-            axis with priority, whose derivatives are 0.
+        supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         droop: c_p, decrease of the pump flow with pressure, scalar [m^3/(s Pa)].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].
@@ -645,9 +684,8 @@ def compute_supply_pressure_derivatives(user, first, count, ports, feed, droop, 
 
     Source: implicit function theorem on "Supply" of models/cat215/README.md.
     """
-    s, total, leader, supply = first * SLOT_COUNT, droop, -1, feed[count - 1]
+    s, total, leader = first * SLOT_COUNT, droop, -1
     most, load = user[s + _RELIEF], user[s + _TANK]
-    has_priority = feed[0] > supply
     if supply > most and user[s + _OVERRIDE] > 0.0:
         total += 1.0 / user[s + _OVERRIDE]
     elif supply >= most and user[s + _MARGIN] == 0.0:
@@ -655,7 +693,7 @@ def compute_supply_pressure_derivatives(user, first, count, ports, feed, droop, 
     for i in range(count):
         out[4 * i + 2], out[4 * i + 3] = 0.0, 0.0
         drop = supply - ports[4 * i + 1]
-        if ports[4 * i] > 0.0 and not (has_priority and i == 0):
+        if ports[4 * i] > 0.0:
             if ports[4 * i + 1] > load:
                 load, leader = ports[4 * i + 1], i
             if drop > 0.0:

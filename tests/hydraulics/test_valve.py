@@ -9,15 +9,14 @@ from scipy.optimize import brentq
 
 from hydrotele.hydraulics.actuator_layout import Slot, actuator_parameters
 from hydrotele.hydraulics.circuit import (
-    FEED,
     NO_EXTRA_STATES,
     SLOT_COUNT,
     circuit_scratch,
-    compute_supply_pressure_derivatives,
     solve_state_supplies,
     step_circuit,
 )
 from hydrotele.hydraulics.laws import counterbalance_opening, end_stop_force, spool_step, valve_opening
+from hydrotele.hydraulics.supply import compute_supply_pressure_derivatives
 from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
@@ -301,7 +300,7 @@ def test_the_supply_follows_the_chambers_with_an_override_as_its_coupling_says(a
     given = {"relief_override": 8e8}
     pressure, user, ports = supply_of(act, **given)
     slopes = np.zeros(len(ports))
-    assert compute_supply_pressure_derivatives(user, 0, 3, ports, ports[FEED:], 0.0, slopes)
+    assert compute_supply_pressure_derivatives(user, 0, 3, ports, pressure, 0.0, slopes)
     for i in range(3):
         side = 2 if act[4 * i] > 0.0 else 3
         moved = [list(act), list(act)]
