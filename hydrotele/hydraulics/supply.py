@@ -214,7 +214,7 @@ def group_size(user, first, count, k):
         k: index of the axis, counted from the first hydraulic actuator [1].
 
     Returns:
-        Number of axes, scalar.
+        Number of axes, scalar [1].
 
     Source: `machine.PumpGroup`.
     """
