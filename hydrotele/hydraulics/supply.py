@@ -619,7 +619,7 @@ def circuit_supply_pressure(user, first, count, ports, flow, droop):
     return solve_supply_pressure(ports, count, user[s + _D], most, flow, droop, user[s + _OVERRIDE])
 
 
-@compile_without_allocation
+@compile_inlined
 def write_supply_couplings(user, first, count, scratch):
     """Write the derivatives of all supply pressures, and which axes they couple, to the work space.
 
@@ -639,23 +639,17 @@ def write_supply_couplings(user, first, count, scratch):
 
     Source: `compute_supply_pressure_derivatives`.
     """
-    k = 0
+    k, end, droop = 0, 0, 0.0
     while k < count:
-        end = k + group_size(user, first, count, k)
-        droop = scratch[LINE_DROOP + k]
-        if scratch[FEED + k] > scratch[FEED + end - 1]:
-            f = FACTOR_OFFSET + 4 * k
-            scratch[BLOCK_SIZE + k] = 1.0
-            scratch[IS_COUPLED + k] = compute_supply_pressure_derivatives(
-                user, first + k, 1, scratch[4 * k :], scratch[FEED + k], 0.0, scratch[f:]
-            )
-            k += 1
-        f = FACTOR_OFFSET + 4 * k
-        scratch[BLOCK_SIZE + k] = end - k
+        if k == end:
+            end, droop = k + group_size(user, first, count, k), scratch[LINE_DROOP + k]
+        has_priority = scratch[FEED + k] > scratch[FEED + end - 1]
+        size, f = 1 if has_priority else end - k, FACTOR_OFFSET + 4 * k
+        scratch[BLOCK_SIZE + k] = size
         scratch[IS_COUPLED + k] = compute_supply_pressure_derivatives(
-            user, first + k, end - k, scratch[4 * k :], scratch[FEED + k], droop, scratch[f:]
+            user, first + k, size, scratch[4 * k :], scratch[FEED + k], 0.0 if has_priority else droop, scratch[f:]
         )
-        k = end
+        k += size
 
 
 @compile_without_allocation
