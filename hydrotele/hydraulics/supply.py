@@ -240,7 +240,7 @@ def write_line_flows(user, first, count, scratch):
     k = 0
     while k < count:
         s, own = (first + k) * SLOT_COUNT, scratch[OWN_SHARE + k]
-        scratch[LINE_FLOW + k] = own * user[s + _PUMP] * scratch[FRACTION + k]
+        scratch[LINE_FLOW + k] = max(_MIN_FLOW_FRACTION, own * scratch[FRACTION + k]) * user[s + _PUMP]
         scratch[LINE_DROOP + k] = own * user[s + _DROOP]
         k += group_size(user, first, count, k)
     for i in range(count):
@@ -251,11 +251,6 @@ def write_line_flows(user, first, count, scratch):
             s = (first + pump) * SLOT_COUNT
             scratch[LINE_FLOW + line] += moved * user[s + _PUMP] * scratch[FRACTION + pump]
             scratch[LINE_DROOP + line] += moved * user[s + _DROOP]
-    k = 0
-    while k < count:
-        smallest = _MIN_FLOW_FRACTION * user[(first + k) * SLOT_COUNT + _PUMP]
-        scratch[LINE_FLOW + k] = max(smallest, scratch[LINE_FLOW + k])
-        k += group_size(user, first, count, k)
 
 
 @compile_without_allocation
@@ -285,8 +280,17 @@ def solve_supply_pressures(user, first, count, scratch):
     write_line_flows(user, first, count, scratch)
     limit = user[first * SLOT_COUNT + _POWER]
     power = _solve_lines(user, first, count, scratch, 1.0, limit > 0.0)
-    if limit == 0.0 or power <= limit:
-        return power
+    if limit > 0.0 and power > limit:
+        power = _limit_power(user, first, count, scratch, power, limit)
+    return power
+
+
+@compile_without_allocation
+def _limit_power(user, first, count, scratch, power, limit):
+    """Reduce the flows of all pumps to the power limit [W]; see `solve_supply_pressures`.
+
+    `power` is that without the limit [W]. The result is the power with it [W].
+    """
     low, high, below, above, side, factor = -math.inf, 0.0, 0.0, math.log(power / limit), 0, 1.0
     for _ in range(_MAX_POWER_STEPS):
         guess = high - above if below == 0.0 else low - below * (high - low) / (above - below)
