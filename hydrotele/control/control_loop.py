@@ -25,7 +25,7 @@ class Controller(NamedTuple):
     """State and parameters of the servo of k axes.
 
     Attributes:
-        parameters: (k, 14) of `control.servo.servo_parameters`.
+        parameters: (k, 15) of `control.servo.servo_parameters`.
         closed: (k,) whether the servo controls an axis by feedback; the others keep their command.
         load: (k,) drive forces (minus computed forces, if any), low-pass filtered with the time
             constant `Servo.load_time`; updated in every tick for hydraulic drives [N] or [N m].
@@ -104,9 +104,9 @@ class PlannedRun(NamedTuple):
     given: np.ndarray
 
 
-_INT, _SERVO_COLUMNS = np.int64, 14
+_INT, _SERVO_COLUMNS = np.int64, 15
 PLANNED_RUN_DTYPE = np.dtype(
-    [(name, _INT) for name in ("axes", "ticks", "channels", "samples", "every", "known")]
+    [(name, _INT) for name in ("axes", "ticks", "channels", "samples", "every", "known", "supplies")]
     + [("period", np.float64)]
     + [(name, _INT) for name in ("parameters", "closed", "load", "command")]  # addresses from here on
     + [(name, _INT) for name in ("scale", "offset", "step", "low", "high", "errors")]
@@ -131,7 +131,7 @@ def planned_run_record(run: PlannedRun) -> np.ndarray:
     record = address_record(PLANNED_RUN_DTYPE, arrays)
     (record["ticks"], record["axes"]), record["every"] = run.reference.shape, table.ticks_per_sample
     (record["samples"], record["channels"]), record["period"] = table.errors.shape, table.period
-    record["known"] = run.forces.is_computed
+    record["known"], record["supplies"] = run.forces.is_computed, len(table.readings.supply)
     return record
 
 
@@ -149,7 +149,7 @@ def _read_planned_run(r):
     )  # fmt: skip
     readings = Readings(
         float64_view(r.joint, k), float64_view(r.rate, k), float64_view(r.head, k), float64_view(r.rod, k),
-        float64_view(r.supply, 1),
+        float64_view(r.supply, r.supplies),
     )  # fmt: skip
     drives = DriveReferences(
         matrix_view(r.velocity, n, k), matrix_view(r.arm, n, k), matrix_view(r.volume_head, n, k),
@@ -190,7 +190,7 @@ def step_planned_run(simulated, planned, tick, steps, stopped):
         run.reference[tick - tick % run.feedback.ticks_per_sample], drive,
         ComputedForce(forces.is_computed, forces.force[tick], forces.rate[tick]), stopped,
     )  # fmt: skip
-    measured = MeasuredState(readings.joint, readings.rate, readings.head, readings.rod, readings.supply[0])
+    measured = MeasuredState(readings.joint, readings.rate, readings.head, readings.rod, readings.supply)
     control_tick(sim, tick, steps, controller, reference, measured)
     for i in range(len(controller.command)):
         run.given[tick, i] = controller.command[i]

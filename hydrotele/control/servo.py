@@ -42,13 +42,13 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
         dt: control period [s].
 
     Returns:
-        (k, 14), with the columns: kind (1 hydraulic with valve, 0 otherwise), head and rod area
+        (k, 15), with the columns: kind (1 hydraulic with valve, 0 otherwise), head and rod area
         [m^2], flow gain [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force
         per command, position gain [1/s], velocity gain of force drives [N s/m] or [N m s/rad],
         fraction of the deadband that is compensated [1], weight of a new drive force in its
         low-pass filter (1 - exp(-dt / `load_time`)) [1], bulk modulus [Pa], and
         `pressure_feedback`, the gain from the deviation of the drive force from its expected value
-        to a velocity [1/s].
+        to a velocity [1/s], index of the supply in `Machine.pumps`.
 
     Raises:
         InputError: a gain is given for an unknown axis.
@@ -63,6 +63,7 @@ def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: 
         position_gain = servo.axis_gains.get(name, servo.position_gain)
         gains = [position_gain, servo.velocity_gain, servo.deadband_compensation, filtered]
         gains += [machine.supply.bulk_modulus if machine.supply else 0.0, servo.pressure_feedback]
+        gains.append(list(machine.pumps).index(machine.pump_of(name)) if axis.valve else 0)
         if axis.valve and machine.supply:
             head, rod = axis.hydraulic_drive.effective_areas
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
@@ -192,14 +193,14 @@ class MeasuredState(NamedTuple):
         rate: (k,) joint velocities [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        supply: supply pressure [Pa], one value per row if there are several rows.
+        supply: (s,) pressures of the supplies [Pa].
     """
 
     joint: np.ndarray
     rate: np.ndarray
     head: np.ndarray
     rod: np.ndarray
-    supply: float | np.ndarray
+    supply: np.ndarray
 
 
 class ComputedForce(NamedTuple):
@@ -241,7 +242,7 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
     the computed force.
 
     Args:
-        parameters: (k, 14) of `servo_parameters`.
+        parameters: (k, 15) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the commands of the others are not changed.
         drive: DriveReference.
         reference: (k,) joint reference at the time of the joint measurement [rad] or [m].
@@ -281,8 +282,8 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
         if computed.is_computed:
             wanted += computed.rate[i] / stiffness
         opening = compute_valve_opening(
-            wanted, head[i], rod[i], supply, parameters[i, 5], area_head, area_rod, volume_head[i],
-            volume_rod[i], parameters[i, 3],
+            wanted, head[i], rod[i], supply[int(parameters[i, 14])], parameters[i, 5], area_head, area_rod,
+            volume_head[i], volume_rod[i], parameters[i, 3],
         )  # fmt: skip
         deadband = parameters[i, 4] * parameters[i, 10]
         command = opening * (1.0 - deadband) + deadband * math.tanh(opening / _DEADBAND_SMOOTHING)

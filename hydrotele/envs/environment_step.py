@@ -175,7 +175,7 @@ def update_sensors(f, e, sim):
 
     Source: `simulate.sensor_models`, as in scenario runs.
     """
-    k, c = f.axes, f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    k, c = f.axes, f.axes + 2 * f.hydraulic + (f.supplies if f.hydraulic > 0 else 0)
     if e.tick % f.every != 0:
         for i in range(k):
             e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
@@ -194,11 +194,11 @@ def update_sensors(f, e, sim):
     )  # fmt: skip
     convert_to_readings(sensors, values, e.error[:c])
     span = f.every * f.period if e.tick > 0 else 0.0
-    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
-    e.supply = store_readings(values, f.hydraulic, span, readings)
+    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
+    store_readings(values, f.hydraulic, span, readings)
 
 
-assert MAX_CHANNELS >= 3 * MAX_AXES + 1
+assert MAX_CHANNELS >= 4 * MAX_AXES
 
 
 _WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
@@ -216,7 +216,7 @@ def _make_simulation_record(f, e, w):
         (f.delayed_command, MAX_AXES)
     )
     delays = float64_view(f.delays + 8 * e.variant * MAX_AXES * 2, MAX_AXES * 2).reshape((MAX_AXES, 2))
-    c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
+    c = f.axes + 2 * f.hydraulic + (f.supplies if f.hydraulic > 0 else 0)
     sensed = float64_view(
         f.sensed + 8 * w.index * f.delayed_sensor * MAX_CHANNELS,
         f.delayed_sensor * MAX_CHANNELS,
@@ -243,7 +243,7 @@ def _run_control_period(f, e, sim):
     reference = TickReference(
         e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
     )  # fmt: skip
-    measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
+    measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
     control_tick(sim, e.tick, f.substeps, controller, reference, measured)
 
 

@@ -10,7 +10,7 @@ from hydrotele.core.compiled import compiled
 
 MAX_AXES = 8  # maximum number of axes of a machine
 MAX_ARM_AXES = 5  # maximum number of arm axes among them
-MAX_CHANNELS = 3 * MAX_AXES + 1  # sensors: positions, head and rod pressures of valves, supply pressure
+MAX_CHANNELS = 4 * MAX_AXES  # sensors: positions, head and rod pressures of valves, supply pressures
 GOAL_SIZE = 96  # values that a task stores per episode for its goal and progress
 MAX_PARAMETERS = 64  # maximum number of task parameters
 MAX_MEASURES = 8  # maximum number of task measures per step, reported in `info`
@@ -42,7 +42,7 @@ EPISODE_STATE = np.dtype(
         ("rate", _F, MAX_AXES),  # difference quotients of the measured positions [rad/s], [m/s]
         ("head", _F, MAX_AXES),  # measured head-side pressures [Pa]
         ("rod", _F, MAX_AXES),  # measured rod-side pressures [Pa]
-        ("supply", _F),  # measured supply pressure [Pa]
+        ("supply", _F, MAX_AXES),  # measured pressures of the supplies [Pa]
         ("error", _F, MAX_CHANNELS),  # random errors of the current sample
         ("reference", _F, MAX_AXES),  # reference axis positions [rad], [m]
         ("reference_rate", _F, MAX_AXES),  # reference axis rates [rad/s], [m/s]
@@ -71,6 +71,7 @@ TASK_PARAMETERS = np.dtype(
         ("autoreset", _I),
         ("axes", _I),  # number of actuators k
         ("hydraulic", _I),  # number of actuators with valves, which come first
+        ("supplies", _I),  # number of supplies with a measured pressure
         ("arm_axes", _I),  # number of arm axes, which come first
         ("actions", _I),  # number of actions, one per driven axis or tip coordinate
         ("observations", _I),
@@ -102,7 +103,7 @@ TASK_PARAMETERS = np.dtype(
         ("limit", _F, MAX_AXES),  # commands at full action [1], or in the drive's unit
         ("arm", _F, 9),  # see kinematics.task_space.arm_parameters
         ("ranges", _F, (MAX_AXES, 2)),  # joint ranges of the axes [rad], [m]
-        ("servo", _F, (MAX_AXES, 14)),  # see control.servo.servo_parameters
+        ("servo", _F, (MAX_AXES, 15)),  # see control.servo.servo_parameters
         ("feedforward", _F),
         ("grid", _F, (MAX_AXES, 2)),  # see control.servo.tabulate_drive_geometry
         ("accuracy", _F, MAX_CHANNELS),  # bound of the uniform random error of every sensor

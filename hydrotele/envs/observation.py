@@ -89,8 +89,8 @@ def list_machine_observation_fields(machine: Machine, axes: tuple[str, ...], arm
         arm_axes: number of axes of the arm.
 
     Returns:
-        The fields, in order: positions, rates, head and rod pressures of the driven axes, supply
-        pressure, pose of the tip, commands.
+        The fields, in order: positions, rates, head and rod pressures of the driven axes,
+        supply pressures, pose of the tip, commands.
     """
     valves = [name for name in axes if machine.axes[name].is_hydraulic]
     fields = [make_position_observation_field(machine, name) for name in axes]
@@ -98,7 +98,7 @@ def list_machine_observation_fields(machine: Machine, axes: tuple[str, ...], arm
     fields += [ObservationField(f"pressure_head.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     fields += [ObservationField(f"pressure_rod.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     if valves:
-        fields.append(ObservationField("pressure_supply", "Pa", *_PRESSURE_BOUNDS))
+        fields += [ObservationField(channel, "Pa", *_PRESSURE_BOUNDS) for channel in machine.supply_channels]
     fields += make_pose_observation_fields(machine, arm_axes)
     for name in axes:
         force = machine.axes[name].force
@@ -138,8 +138,9 @@ def write_machine_observation(f, e, out):
             out[at] = e.rod[f.driven_axis[a]]
             at += 1
     if f.hydraulic > 0:
-        out[at] = e.supply
-        at += 1
+        for i in range(f.supplies):
+            out[at] = e.supply[i]
+            at += 1
     pose = np.empty(MAX_ARM_AXES)
     compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
     for c in range(max(4, f.arm_axes)):

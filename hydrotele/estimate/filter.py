@@ -64,7 +64,7 @@ _TRIED = 1.0e-4  # of its largest size, by which an input of a pump drive is tri
 _ROWS_STEP = 4.0e-3  # s, for what inputs do in a row
 BALANCES = ("force", "flow_head", "flow_rod", "command")
 SUPPLY = "flow_supply"
-"""Balance of the pump that valves share; its input stands under the first axis with a valve."""
+"""Balance of a pump that valves share; its input stands under the first axis that the pump feeds."""
 
 
 class Input(NamedTuple):
@@ -96,8 +96,9 @@ def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, 
         facts = machine.axes[axis]
         count = 4 if facts.valve else 3 if facts.pump else 1
         found += [Input(balance, axis) for balance in BALANCES[:count]]
-    if ADDED_DELIVERY_STATE in extra_state_names(machine):
-        found.append(Input(SUPPLY, next(iter(machine.valve_axes))))
+    for pump in machine.pumps:
+        if f"{ADDED_DELIVERY_STATE}.{pump}" in extra_state_names(machine):
+            found.append(Input(SUPPLY, machine.axes_of_pump(pump)[0]))
     return tuple(found)
 
 
@@ -109,8 +110,7 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
         if balance == "command":
             sizes.append(0.5)
         elif balance == SUPPLY:
-            assert machine.supply
-            sizes.append(machine.supply.pump_flow)
+            sizes.append(machine.pumps[machine.pump_of(axis)].pump_flow)
         elif balance != "force":
             pump = facts.pump
             sizes.append(
@@ -120,7 +120,7 @@ def input_sizes(machine: Machine, inputs: Sequence[Input]) -> np.ndarray:
         elif facts.force:
             sizes.append(abs(facts.force.gain) * facts.force.command_limit)
         else:
-            pressure = machine.supply.relief_pressure if machine.supply else _USUAL_PRESSURE
+            pressure = machine.pumps[machine.pump_of(axis)].relief_pressure if machine.supply else _USUAL_PRESSURE
             sizes.append(pressure * facts.hydraulic_drive.effective_areas[0])
     return np.array(sizes)
 
@@ -226,10 +226,10 @@ def input_columns(
         if balance == "force":
             columns[:, m, rates : 2 * rates] = response[:, i]
         elif balance == SUPPLY:
-            assert machine.supply
-            at = first + 4 * model.hydraulic + extra_state_names(machine).index(ADDED_DELIVERY_STATE)
+            pump = machine.pump_of(axis)
+            at = first + 4 * model.hydraulic + extra_state_names(machine).index(f"{ADDED_DELIVERY_STATE}.{pump}")
             follows = 2.0 / period * math.tanh(0.5 * period / TERM_FLOW_TIME_CONSTANT)  # of its exponential
-            columns[:, m, at] = follows / machine.supply.pump_flow
+            columns[:, m, at] = follows / machine.pumps[pump].pump_flow
         elif balance == "command":
             assert facts.valve
             columns[:, m, first + 4 * i + 1] = facts.valve.bandwidth**2
@@ -474,9 +474,9 @@ def _slopes(model, sp, z, nudge, slope, moved):
             for r in range(len(z)):
                 moved[r] = z[r]
             moved[s] += nudge[s]
-            above = supply_of(model, sp, moved)
+            above = supply_of(model, sp, moved, model.drive[c])
             moved[s] -= 2.0 * nudge[s]
-            below = supply_of(model, sp, moved)
+            below = supply_of(model, sp, moved, model.drive[c])
             slope[c, s] = model.scale[c] * (above - below) / (2.0 * nudge[s])
 
 
@@ -865,9 +865,10 @@ def _bound_memory(model, z):
         if model.user[u + _BRISTLE_STIFFNESS] > 0.0:
             at, unequal = int(model.user[u + _BRISTLE]), model.user[u + _ASYMMETRY]
             act[at] = min(1.0 + unequal, max(unequal - 1.0, act[at]))
-    if model.hydraulic > 0 and model.user[_DELIVERY] > 0.0:
-        at = int(model.user[_DELIVERY])
-        act[at] = min(1.0, max(0.0, act[at]))
+    for i in range(model.hydraulic):
+        if model.user[i * SLOT_COUNT + _DELIVERY] > 0.0:
+            at = int(model.user[i * SLOT_COUNT + _DELIVERY])
+            act[at] = min(1.0, max(0.0, act[at]))
 
 
 @compile_without_allocation

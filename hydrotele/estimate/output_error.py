@@ -93,7 +93,7 @@ def uncertain_parameters(machine: Machine) -> Guess:
         if joint_range_at_drive(machine, axis) and facts.cylinder and not facts.four_bar:
             found.append(linkage(machine, axis))
     if machine.supply and machine.hydraulic_axes:
-        found.append(supply_limits(machine))
+        found += [supply_limits(machine, name) for name in machine.pumps]
     return Guess(tuple((hypothesis, np.zeros(hypothesis.size)) for hypothesis in found))
 
 
@@ -246,29 +246,29 @@ def linkage(machine: Machine, axis: str) -> Hypothesis:
     return Hypothesis("linkage", axis, {"base": ratio, "rod": ratio, "angle": angle}, change)
 
 
-def supply_limits(machine: Machine) -> Hypothesis:
-    """Relief pressure and pump flow.
+def supply_limits(machine: Machine, name: str = "supply") -> Hypothesis:
+    """Return the hypothesis on relief pressure and flow of a pump.
 
     Args:
         machine: the nominal machine, with valves.
+        name: name of the pump.
 
     Returns:
         The hypothesis, of two parameters, one on a constant-pressure supply.
     """
-    assert machine.supply
-    parameters = {"relief_pressure": _log(_share(machine, "relief_pressure", "supply"), math.log(3.0))}
-    if machine.supply.kind != "constant_pressure":
-        share = _share(machine, "pump_flow_limit", "supply")
+    place, path = ("supply", "supply") if name == "supply" else (f"supply.{name}", f"supplies.{name}")
+    parameters = {"relief_pressure": _log(_share(machine, "relief_pressure", place), math.log(3.0))}
+    if machine.pumps[name].kind != "constant_pressure":
+        share = _share(machine, "pump_flow_limit", place)
         parameters["pump_flow"] = _log(share, math.log(3.0))
 
     def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
-        assert nominal.supply
         for field, value in values.items():
-            new = getattr(nominal.supply, field) * math.exp(value)
-            nominal = with_value(nominal, f"supply.{field}", new)
+            new = getattr(nominal.pumps[name], field) * math.exp(value)
+            nominal = with_value(nominal, f"{path}.{field}", new)
         return nominal
 
-    return Hypothesis("supply", "supply", parameters, change)
+    return Hypothesis("supply", place, parameters, change)
 
 
 def _log(scale: float, most: float) -> Parameter:

@@ -21,15 +21,14 @@ from hydrotele.hydraulics.actuator_layout import (
     machine_terms_table,
 )
 from hydrotele.hydraulics.circuit import (
+    FEED,
     NO_EXTRA_STATES,
     SCRATCH_SIZE,
     actuator_end_stop_force,
     add_command_terms,
-    circuit_supply_pressure,
-    compute_inlet_conditions,
-    delivered_flow_fraction,
     force_after_friction,
     make_drive_state,
+    solve_state_supplies,
     step_circuit,
     write_term_state_rates,
 )
@@ -97,7 +96,7 @@ class Model(NamedTuple):
         gear: (nu,) transmission of every drive, -1 if rigid.
         transmission: (t, 4) GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH in SI.
         kind: (c,) what every channel shows: POSITION, LENGTH, HEAD, ROD or SUPPLY.
-        drive: (c,) drive of every channel.
+        drive: (c,) drive of every channel; of a supply the first that it feeds.
         scale: (c,) sensor scales [1].
         offset: (c,) sensor offsets [channel's unit].
         lag: (c,) sensor delays [s].
@@ -161,7 +160,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
     names = [f"{machine.position_kind(a)}.{a}" for a in order]
     names += [f"length.{a}" for a in order if machine.axes[a].cylinder]
     names += [f"pressure_{side}.{a}" for a in valves for side in ("head", "rod")]
-    return (*names, "pressure_supply") if machine.valve_axes else tuple(names)
+    return (*names, *machine.supply_channels) if machine.valve_axes else tuple(names)
 
 
 def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
@@ -179,6 +178,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
     gears = [axis.transmission for axis in axes if axis.transmission]
     parsed = [parse_channel(name) for name in channels]
     errors = [machine.sensor_errors.get(name, SensorError()) for name in channels]
+    fed_first = {name: machine.axes_of_pump(name)[0] for name in machine.supplies}
     index, count = [], 0
     for axis in axes:
         index.append(count if axis.transmission else -1)
@@ -192,7 +192,7 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         gear=np.array(index, int),
         transmission=np.array([(g.inertia, g.stiffness, g.damping, g.backlash) for g in gears], float).reshape(-1, 4),
         kind=np.array([_KINDS[c.kind] for c in parsed], int),
-        drive=np.array([order.index(c.axis) if c.axis else 0 for c in parsed], int),
+        drive=np.array([order.index(fed_first.get(c.axis, c.axis)) if c.axis else 0 for c in parsed], int),
         scale=np.array([e.scale for e in errors], float),
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
@@ -286,16 +286,16 @@ def store_activations(model, sp, z):
 
 
 @compile_without_allocation
-def supply_of(model, sp, z):
-    """Supply pressure in a state, scalar [Pa]; `sp.act` is written, see `set_activations`.
+def supply_of(model, sp, z, i):
+    """Return the pressure that feeds hydraulic drive i in a state, scalar [Pa].
+
+    `sp.act` is written, see `set_activations`, and `sp.scratch` with the pressures of all drives.
 
     Source: nominal model, "Supply".
     """
-    user, count, act = model.user, model.hydraulic, sp.act
     set_activations(model, sp, z)
-    compute_inlet_conditions(user, act, act, sp.scratch, 0, count, 0.0, act)
-    share = 1.0 if model.memory < 0 else delivered_flow_fraction(user, 0, act)
-    return circuit_supply_pressure(user, 0, count, sp.scratch, share)
+    solve_state_supplies(model.user, 0, model.hydraulic, sp.act, sp.scratch)
+    return sp.scratch[FEED + i]
 
 
 @compile_without_allocation
@@ -316,7 +316,7 @@ def term_force(model, sp, z, i, velocity):
     commanded = i >= count and has_term(model.terms, ON_COMMAND, i)
     if not (commanded or has_term(model.terms, ON_FORCE, i)):
         return 0.0, 0.0
-    supply = supply_of(model, sp, z) if count > 0 else 0.0
+    supply = supply_of(model, sp, z, min(i, count - 1)) if count > 0 else 0.0
     s = make_drive_state(
         model.user, i, count, sp.act, supply, sp.time[0], sp.drive[X, i], velocity,
         sp.drive[COMMAND, i], model.gain[i],
@@ -708,13 +708,13 @@ def advance(model, sp, z, command, row, period, steps, trail):
                 given = GIVEN
             first = np.int64(0)  # numba compiles a function anew for a written number
             drives = Drives(count, act, drive[X], drive[V], drive[given])
-            _, supply = step_circuit(
+            step_circuit(
                 model.user, first, drives, h, sp.act_dot, sp.scratch, model.terms, sp.time[0],
                 model.memory,
             )  # fmt: skip
             if model.memory >= 0 and len(model.terms) > 0:
                 drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
-                write_term_state_rates(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
+                write_term_state_rates(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], sp.scratch[FEED:])
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
         if model.memory >= 0:
@@ -779,7 +779,7 @@ def _shown(model, sp, z, c):
     if kind == LENGTH:
         return sp.drive[X, i]
     if kind == SUPPLY:
-        return supply_of(model, sp, z)
+        return supply_of(model, sp, z, i)
     return sp.act[4 * i + kind]
 
 

@@ -56,7 +56,13 @@ from hydrotele.hydraulics.actuator_layout import (
     actuator_order,
     max_pump_drive_time_step,
 )
-from hydrotele.hydraulics.circuit import circuit_scratch, compute_inlet_conditions, demanded_flow_fraction
+from hydrotele.hydraulics.circuit import (
+    circuit_scratch,
+    compute_inlet_conditions,
+    group_size,
+    write_demanded_fractions,
+)
+from hydrotele.hydraulics.supply import DEMAND
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 
@@ -159,8 +165,9 @@ def start_state(
             state[s] = shown.get(f"{kind}.{axis}", 3e6 * scales[s])
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind] * scales[s]
-    if DELIVERY_STATE in names:
-        state[names.index(DELIVERY_STATE)] = _drawn(model, state)
+    for k, pump in enumerate(machine.pumps):
+        if f"{DELIVERY_STATE}.{pump}" in names:
+            state[names.index(f"{DELIVERY_STATE}.{pump}")] = _drawn_fractions(model, state)[k]
     _place_by_lengths(model, data, state, shown)
     spread = np.diag(wide**2)
     _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
@@ -199,12 +206,17 @@ def _place_by_lengths(model: Model, data: Dataset, state: np.ndarray, shown: Map
         state[:], left = moved, other
 
 
-def _drawn(model: Model, state: np.ndarray) -> float:
-    """Share of its flow that a pump gives whose valves have stood where they stand."""
+def _drawn_fractions(model: Model, state: np.ndarray) -> list[float]:
+    """Return the fraction of its flow that each pump delivers if all valves have been at rest."""
     act = state[2 * (len(model.mech.independent) + len(model.transmission)) :]
     ports = circuit_scratch()
     compute_inlet_conditions(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
-    return demanded_flow_fraction(model.user, 0, model.hydraulic, ports)
+    write_demanded_fractions(model.user, 0, model.hydraulic, ports)
+    found, i = [], 0
+    while i < model.hydraulic:
+        found.append(float(ports[DEMAND + i]))
+        i += group_size(model.user, 0, model.hydraulic, i)
+    return found
 
 
 def _first_rows(run: RunData, c: int) -> int:

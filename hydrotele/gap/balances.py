@@ -34,14 +34,23 @@ from hydrotele.hydraulics.circuit import (
     advance_pump_flow_fraction,
     axis_valve_opening,
     chamber_flows,
-    circuit_supply_pressure,
     compute_inlet_conditions,
-    delivered_flow_fraction,
-    demanded_flow_fraction,
+    group_size,
+    solve_supply_pressures,
+    write_demanded_fractions,
 )
 from hydrotele.hydraulics.laws import air_compliance, air_softening_factor, relief_and_makeup_flow, spool_step
 from hydrotele.hydraulics.pump_drive import load_cylinder_force, load_pressure_step
-from hydrotele.hydraulics.supply import drawn_flow, max_supply_pressure
+from hydrotele.hydraulics.supply import (
+    DEMAND,
+    FEED,
+    LINE_DROOP,
+    LINE_FLOW,
+    SCRATCH_SIZE,
+    drawn_flow,
+    max_supply_pressure,
+    write_delivered_fractions,
+)
 from hydrotele.identify import optimal_smoother
 from hydrotele.kinematics.drive_linkage import axis_linkage
 from hydrotele.kinematics.linkages import LoopOpenError
@@ -61,7 +70,7 @@ _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _BUBBLES = int(Slot.ENTRAINED_AIR)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
-_MEMORY, _PUMP = int(Slot.EXTRA_STATES), int(Slot.PUMP_FLOW)
+_MEMORY = int(Slot.EXTRA_STATES)
 
 
 @compiled
@@ -153,21 +162,27 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
 
 
 @compiled
-def _settle(user, spools, pressures, period, act, ports):
-    """Write a row's activations and ports; a slow pump has followed over a period, 0 at first."""
-    count, at = len(spools), int(user[_DELIVERY])
+def _solve_row(user, spools, pressures, period, act, ports):
+    """Write a row's activations and supplies; slow pumps have followed over a period, 0 at first."""
+    count = len(spools)
     for i in range(count):
         act[4 * i] = spools[i]
         act[4 * i + 2], act[4 * i + 3] = pressures[i]
+    i = 0
     compute_inlet_conditions(user, act, act, ports, 0, count, 0.0, act)
-    if user[_LAG] > 0.0:
-        wanted = demanded_flow_fraction(user, 0, count, ports)
-        act[at] = advance_pump_flow_fraction(user, 0, wanted, act[at], period) if period > 0.0 else wanted
+    write_demanded_fractions(user, 0, count, ports)
+    while i < count:
+        if user[i * SLOT_COUNT + _LAG] > 0.0:
+            wanted, at = ports[DEMAND + i], int(user[i * SLOT_COUNT + _DELIVERY])
+            act[at] = advance_pump_flow_fraction(user, i, wanted, act[at], period) if period > 0.0 else wanted
+        i += group_size(user, 0, count, i)
+    write_delivered_fractions(user, 0, count, act, ports)
+    solve_supply_pressures(user, 0, count, ports)
 
 
 @compiled
 def supply_pressures(user, spools, pressures, period):
-    """Supply pressure from spools and chamber pressures.
+    """Return the supply pressures of all axes from spools and chamber pressures.
 
     Args:
         user: (h * SLOTS,) numbers of the h valves.
@@ -177,29 +192,30 @@ def supply_pressures(user, spools, pressures, period):
             from row to row.
 
     Returns:
-        (n,) [Pa].
+        (h, n) pressure that feeds each axis [Pa].
 
     Source: nominal model, "Supply".
     """
     count, rows = spools.shape
-    ports, out = np.zeros(4 * count), np.empty(rows)
+    ports, out = np.zeros(SCRATCH_SIZE), np.empty((count, rows))
     act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
-        _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
-        out[k] = circuit_supply_pressure(user, 0, count, ports, delivered_flow_fraction(user, 0, act))
+        _solve_row(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
+        out[:, k] = ports[FEED : FEED + count]
     return out
 
 
 @compiled
-def pump_lacks(user, spools, pressures, supply, period):
+def pump_lacks(user, spools, pressures, supply, period, begin):
     """Flow that a pump which is short gives beyond what it should.
 
     Args:
         user: (h * SLOTS,) numbers of the h valves.
         spools: (h, n) [1].
         pressures: (h, 2, n) head and rod pressures [Pa].
-        supply: (n,) supply pressure [Pa].
+        supply: (n,) pressure of the pump [Pa].
         period: as of `supply_pressures`.
+        begin: index of the first valve of the pump.
 
     Returns:
         (2, n): what the valves draw at that pressure less the pump's flow [m^3/s], and by how much
@@ -208,13 +224,14 @@ def pump_lacks(user, spools, pressures, supply, period):
     Source: nominal model, "Supply".
     """
     count, rows = spools.shape
-    ports, out = np.zeros(4 * count), np.empty((2, rows))
+    ports, out = np.zeros(SCRATCH_SIZE), np.empty((2, rows))
+    size = group_size(user, 0, count, begin)
     act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
-        _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
-        given = user[_PUMP] * delivered_flow_fraction(user, 0, act)
-        out[0, k] = drawn_flow(user, 0, count, ports, supply[k]) - given
-        out[1, k] = max_supply_pressure(user, 0, count, ports) - supply[k]
+        _solve_row(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
+        drawn = drawn_flow(user, begin, size, ports[4 * begin :], supply[k], ports[LINE_DROOP + begin])
+        out[0, k] = drawn - ports[LINE_FLOW + begin]
+        out[1, k] = max_supply_pressure(user, begin, size, ports[4 * begin :]) - supply[k]
     return out
 
 
@@ -271,7 +288,7 @@ def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping
     told = noise or {}
     for k, (name, values) in enumerate(log.columns.items()):
         channel = parse_channel(name)
-        if channel.truth or (channel.axis and channel.axis not in machine.axes):
+        if channel.truth or (channel.axis and channel.axis not in {*machine.axes, *machine.supplies}):
             continue
         on_clock = np.full(rows, np.nan)
         on_clock[clock.tick] = values[clock.row]
@@ -486,8 +503,10 @@ def run_balances(machine: Machine, data: Dataset, run: RunData, noise: np.ndarra
     return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
 
 
-def pump_lack(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flow that the pump of the valves gives beyond the model's, where it is short.
+def pump_lack(
+    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray, name: str = "supply"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flow that a pump of valves gives beyond the model's, where it is short.
 
     Read off the supply's balance, row by row: a filter whose model has the pump at its relief
     setting cannot tell that its flow is short, as more or less of it would change nothing.
@@ -497,6 +516,7 @@ def pump_lack(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) 
         data: the dataset.
         run: one of its runs.
         noise: as of `run_balances`.
+        name: name of the pump.
 
     Returns:
         ((n,) flow [m^3/s], (n,) its standard deviation): NaN where the pressure is within
@@ -505,18 +525,17 @@ def pump_lack(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) 
     """
     signals = _signals(machine, data, run, noise)
     unknown = np.full((2, len(run.command)), np.nan)
-    parts = _supply_signals(machine, signals)
+    parts = _supply_signals(machine, signals, name)
     if parts is None or len(signals.time) != unknown.shape[1]:
         return unknown[0], unknown[1]
     user, spools, pressures, supplies = parts
     found = np.stack([
-        pump_lacks(user, spools, p, supply, signals.period)
+        pump_lacks(user, spools, p, supply, signals.period, _first_valve(machine, name))
         for p, supply in zip(pressures, supplies, strict=True)
     ])  # fmt: skip
     flow, below = found[:, 0], found[0, 1]
-    supply = machine.supply
-    senses = supply is not None and supply.kind == "load_sensing"
-    margin = supply.load_sensing_margin if supply and senses else 0.0
+    pump = machine.pumps[name]
+    margin = pump.load_sensing_margin if pump.kind == "load_sensing" else 0.0
     short = below > np.maximum(_NOT_SHORT * (below + supplies[0]), _HALF * margin)
     return np.where(short, flow[0], np.nan), _scatter(flow, signals.period)
 
@@ -549,7 +568,7 @@ def balances(
         noise: channel -> standard deviation of one reading, in place of the sensors'.
 
     Returns:
-        Law -> axis (or "supply") -> Balance; what lacks a channel is absent.
+        Law -> axis (or "supply", "supply.<pump>") -> Balance; what lacks a channel is absent.
 
     Raises:
         InputError: the time stamps follow no clock, or the machine has no such sensors.
@@ -655,7 +674,7 @@ def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.
 def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
     numbers = actuator_parameters(machine)
     for name, axis in machine.hydraulic_axes.items():
-        channels = f"pressure_head.{name}", f"pressure_rod.{name}", "pressure_supply"
+        channels = f"pressure_head.{name}", f"pressure_rod.{name}", machine.supply_channel(name)
         motion = joint_motion(machine, signals, name)
         if axis.valve is None or motion is None or name not in signals.command:
             continue
@@ -686,36 +705,45 @@ def _flow_and_timing(machine: Machine, signals: Signals) -> Found:
 
 
 def _supply(machine: Machine, signals: Signals) -> Found:
-    parts = _supply_signals(machine, signals)
-    if parts is None:
-        return
-    user, spools, pressures, supplies = parts
-    expected = np.stack([supply_pressures(user, spools, p, signals.period) for p in pressures])
-    yield (
-        _SUPPLY,
-        _SUPPLY,
-        _balance(signals.time, *_in_band(supplies - expected, signals.period), "Pa"),
-    )
+    for name in machine.pumps:
+        parts = _supply_signals(machine, signals, name)
+        if parts is None:
+            continue
+        user, spools, pressures, supplies = parts
+        first = _first_valve(machine, name)
+        expected = np.stack([supply_pressures(user, spools, p, signals.period)[first] for p in pressures])
+        place = _SUPPLY if name == _SUPPLY else f"{_SUPPLY}.{name}"
+        yield _SUPPLY, place, _balance(signals.time, *_in_band(supplies - expected, signals.period), "Pa")
 
 
-def _supply_signals(machine: Machine, signals: Signals) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """What the supply's balance is made of, None if a channel is missing.
+def _first_valve(machine: Machine, pump: str) -> int:
+    """Return the index of the first valve that a pump feeds among all valves."""
+    return list(machine.valve_axes).index(machine.axes_of_pump(pump)[0])
+
+
+def _supply_signals(
+    machine: Machine, signals: Signals, pump: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return what the balance of a pump is made of, None if a channel is missing.
 
     Returns:
         The h valves' numbers, their spools (h, n) [1], the pressures of their chambers
-        (d, h, 2, n) and of the supply (d, n) [Pa].
+        (d, h, 2, n) and of the pump (d, n) [Pa].
     """
     names = list(machine.valve_axes)
     chambers = [f"pressure_{side}.{name}" for name in names for side in ("head", "rod")]
     commanded = all(name in signals.command for name in names)
-    if not (names and commanded and signals.has("pressure_supply", *chambers)):
+    if not (names and commanded and machine.axes_of_pump(pump)):
+        return None
+    channel = machine.supply_channel(machine.axes_of_pump(pump)[0])
+    if not signals.has(channel, *chambers):
         return None
     numbers = actuator_parameters(machine)
     user = np.concatenate([numbers[name] for name in names])
     spools = np.stack([spool_positions(machine, signals, name) for name in names])
     table = np.stack([signals.smoothed[c][:, 0] for c in chambers], axis=1)
     pressures = table.reshape(len(table), len(names), 2, -1)
-    return user, spools, pressures, signals.smoothed["pressure_supply"][:, 0]
+    return user, spools, pressures, signals.smoothed[channel][:, 0]
 
 
 def _in_band(sets: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -210,6 +210,7 @@ def effect_title(effect: NamedEffect | Alternative | Candidate) -> str:
     place = _PLACES.get(effect.location)
     if place is None:
         words = effect.location.replace(".", " ").replace("_", " ").replace("/", " ").split()
+        words = words[::-1] if words[:1] == ["supply"] else words  # supply.rear: of the rear supply
         place = "of the " + " ".join(_SIDES.get(word, word) for word in words)
     return f"{effect.name.replace('_', ' ')} {place}" if effect.location else effect.name
 

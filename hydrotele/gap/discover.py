@@ -124,7 +124,7 @@ def input_of(balance: str, axis: str) -> Input:
 
 @compiled
 def _drives_of(model, sp, states, position, velocity, act, supply):
-    """Positions, velocities (n, nu), activations (n, 4 h) and supply (n,) along states (n, nz)."""
+    """Positions, velocities (n, nu), activations (n, 4 h) and supplies (n, h) along states (n, nz)."""
     n, t = len(model.mech.independent), len(model.transmission)
     for row in range(len(states)):
         place(model, sp, states[row])
@@ -136,8 +136,8 @@ def _drives_of(model, sp, states, position, velocity, act, supply):
             velocity[row, i] = total
         for k in range(act.shape[1]):
             act[row, k] = sp.act[k]
-        if model.hydraulic > 0:
-            supply[row] = supply_of(model, sp, states[row])
+        for i in range(model.hydraulic):
+            supply[row, i] = supply_of(model, sp, states[row], i)
 
 
 def see(data: Dataset, judged: Judged, track: Track) -> Seen:
@@ -155,7 +155,7 @@ def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = F
     model = following_model(machine, data)
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
-    supply, act = np.zeros(len(states)), np.empty((len(states), 4 * model.hydraulic))
+    supply, act = np.zeros((len(states), model.hydraulic)), np.empty((len(states), 4 * model.hydraulic))
     _drives_of(model, model_space(model), np.ascontiguousarray(states), position, velocity, act, supply)
     clock = track.run.start + track.run.period * np.arange(len(states))
     values: dict[str, dict[str, np.ndarray]] = {}
@@ -170,7 +170,7 @@ def see_run(machine: Machine, data: Dataset, track: Track, is_smoothed: bool = F
                     "force": areas[0] * head - areas[1] * rod}  # fmt: skip
             own["pump_speed" if facts.pump else "spool"] = act[:, 4 * i]
             if facts.valve:
-                own["pressure_supply"] = supply
+                own["pressure_supply"] = supply[:, i]
         elif facts.force:
             own["force"] = facts.force.gain * own["command"]
         values[axis] = own
@@ -305,7 +305,8 @@ def candidate_laws(lacks: Lacks, laws: Sequence[Learned], hopeless: set[tuple[st
             looked += possible_laws(lacks, (i, THROUGH), rank < _COUPLED, taken)
     ranked, pump = _best_first(looked), []
     if not any(balance == SUPPLY for balance, _ in hopeless):
-        pump = _pump_laws(lacks)[:_PUMP_LAWS]
+        found = (_pump_laws(lacks, name) for name in _limited_pumps(lacks))
+        pump = [law for laws in found for law in laws[:_PUMP_LAWS]]
     best = ranked[:_TRIED] + pump
     for size in (1, 2):  # what one remembers may be chance
         plain = [p for p in ranked if not p[0][2].memory and len(p[0][2].variables) == size][:1]
@@ -432,21 +433,28 @@ def _best_first(looked: Sequence[tuple[Case, Regression]]) -> list[tuple[Case, R
     return sorted(best.values(), key=place)
 
 
-def _pump_laws(lacks: Lacks) -> list[tuple[Case, Regression]]:
-    """Laws of what the pump lacks that a machine's valves share, best first.
+def _limited_pumps(lacks: Lacks) -> list[str]:
+    """Return the pumps of valves whose flow is limited and to which no term adds.
 
-    None where a term already adds to its flow: what that lacks is an unknown input of the filter.
+    What a term of the flow lacks is an unknown input of the filter.
     """
+    machine = lacks.judged.guess.machine(lacks.evidence.data.machine)
+    known = {machine.pump_of(t.axis) for t in machine.terms if t.balance == SUPPLY}
+    return [
+        name for name, pump in machine.pumps.items()
+        if pump.kind != "constant_pressure" and machine.axes_of_pump(name) and name not in known
+    ]  # fmt: skip
+
+
+def _pump_laws(lacks: Lacks, name: str) -> list[tuple[Case, Regression]]:
+    """Return laws of what a pump lacks that valves share, best first."""
     evidence, judged, seen = lacks.evidence, lacks.judged, lacks.seen
     data = evidence.data
     machine = judged.guess.machine(data.machine)
-    limited = machine.supply is not None and machine.supply.kind != "constant_pressure"
-    if not (limited and machine.valve_axes) or any(t.balance == SUPPLY for t in machine.terms):
-        return []
     noise = judged.tracks[0].levels.noise
-    told = evidence.map(lambda track: pump_lack(machine, data, track.run, noise), judged.tracks)
+    told = evidence.map(lambda track: pump_lack(machine, data, track.run, noise, name), judged.tracks)
     rows = [s.known & np.isfinite(flow) for s, (flow, _) in zip(seen, told, strict=True)]
-    own = Input(SUPPLY, next(iter(machine.valve_axes)))
+    own = Input(SUPPLY, machine.axes_of_pump(name)[0])
     used = [k for k, row in enumerate(rows) if np.count_nonzero(row) > _SHORT_ROWS]
     if not used:
         return []

@@ -116,7 +116,8 @@ def _speed(machine: Machine, name: str, at: float, width: float) -> float:
     drop = 0.5 * (machine.supply.relief_pressure - machine.supply.tank_pressure)
     flow = axis.valve.rated_flow * math.sqrt(drop / axis.valve.rated_pressure_drop)
     arm = max(abs(float(axis_linkage(machine, name).rate(at))), 1e-3)
-    return _SHARE * min(flow, machine.supply.pump_flow) / (axis.hydraulic_drive.effective_areas[0] * arm)
+    flow = min(flow, machine.pumps[machine.pump_of(name)].pump_flow)
+    return _SHARE * flow / (axis.hydraulic_drive.effective_areas[0] * arm)
 
 
 def _clear(machine: Machine, home: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:

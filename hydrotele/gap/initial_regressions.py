@@ -289,9 +289,10 @@ class _Problem:
                 *positions, *(c for c in pressures if c.endswith(f".{axis}")))  # fmt: skip
             if facts.is_hydraulic:
                 commands = tuple(c for c in self.channels if c.startswith("command"))
-                supplied = "pressure_supply" in self.channels
+                fed_from = self.machine.supply_channel(axis)
+                supplied = fed_from in self.channels
                 used["flow", axis] = (
-                    *own, *(c for c in pressures if not supplied or c.endswith((f".{axis}", "supply"))),
+                    *own, *(c for c in pressures if not supplied or c.endswith(f".{axis}") or c == fed_from),
                     *(commands if not supplied else (f"command.{axis}",)),
                 )  # fmt: skip
             if facts.cylinder:
@@ -474,10 +475,11 @@ def _valve_flow(
     if facts.valve is None or not signals.has(f"pressure_head.{axis}", f"pressure_rod.{axis}"):
         return None
     head, rod = (signals.smoothed[f"pressure_{side}.{axis}"][0] for side in ("head", "rod"))
-    if signals.has("pressure_supply"):
-        supply = signals.smoothed["pressure_supply"][0, 0]
+    channel = machine.supply_channel(axis)
+    if signals.has(channel):
+        supply = signals.smoothed[channel][0, 0]
     else:
-        supply = _modelled_supply(machine, signals)
+        supply = _modelled_supply(machine, signals, axis)
     if supply is None:
         return None
     position, velocity = motion
@@ -488,8 +490,11 @@ def _valve_flow(
     return facts.hydraulic_drive.effective_areas[0] * velocity - lacks[0]
 
 
-def _modelled_supply(machine: Machine, signals: Signals) -> np.ndarray | None:
-    """(n,) supply pressure of the model at measured commands and chamber pressures; None if one is missing."""
+def _modelled_supply(machine: Machine, signals: Signals, axis: str) -> np.ndarray | None:
+    """Return the (n,) supply pressure of an axis in the model at measured commands and chamber pressures.
+
+    The result is None if a command or pressure is missing.
+    """
     numbers = actuator_parameters(machine)
     names = list(machine.valve_axes)
     chambers = [f"pressure_{side}.{name}" for name in names for side in ("head", "rod")]
@@ -497,7 +502,8 @@ def _modelled_supply(machine: Machine, signals: Signals) -> np.ndarray | None:
         return None
     spools = np.stack([_delayed_command(machine, signals, name) for name in names])
     pressures = np.stack([signals.smoothed[c][0, 0] for c in chambers]).reshape(len(names), 2, -1)
-    return supply_pressures(np.concatenate([numbers[name] for name in names]), spools, pressures, signals.period)
+    user = np.concatenate([numbers[name] for name in names])
+    return supply_pressures(user, spools, pressures, signals.period)[names.index(axis)]
 
 
 # -- robust fit -------------------------------------------------------------------------------------------------------

@@ -22,9 +22,13 @@ class Slot(enum.IntEnum):
     For optional effects, the value 0 disables the effect (for metering ratios, 1 does). BRISTLE,
     DELIVERY and ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis.
     EXTRA_STATES is the number of additional activations after those of the hydraulic axes (see
-    `extra_state_names`). CURVES, the last, is the start of two flow curves, for the positive and
-    the negative direction. Each has the number of knots (0: linear), CURVE_KNOTS travels and
-    CURVE_KNOTS openings.
+    `extra_state_names`). The axes of a pump follow one another; the parameters of a pump are read
+    at its first axis. There GROUP_SIZE is their number, and PRIORITY_DROP the pressure drop that
+    the first axis keeps before the others are fed. MERGE_FROM and MERGE_TO are the first axes of
+    two pumps, counted from the first hydraulic axis. MERGE_CURVE is the start of the curve of a
+    merging valve: number of knots (0: no valve), CURVE_KNOTS spool positions, CURVE_KNOTS shares.
+    CURVES, the last, is the start of two flow curves, for the positive and the negative direction.
+    Each has the number of knots (0: linear), CURVE_KNOTS travels and CURVE_KNOTS openings.
     """
 
     @staticmethod
@@ -95,7 +99,13 @@ class Slot(enum.IntEnum):
     DELIVERY = enum.auto()
     ADDED_DELIVERY = enum.auto()
     EXTRA_STATES = enum.auto()
-    CURVES = enum.auto()
+    GROUP_SIZE = enum.auto()
+    PRIORITY_DROP = enum.auto()
+    ENGINE_POWER = enum.auto()
+    MERGE_FROM = enum.auto()
+    MERGE_TO = enum.auto()
+    MERGE_CURVE = enum.auto()
+    CURVES = MERGE_CURVE + 1 + 2 * CURVE_KNOTS
 
 
 CURVE_SIZE = 1 + 2 * CURVE_KNOTS  # number of parameters of one flow curve
@@ -152,8 +162,8 @@ class ActuatorKind(enum.IntEnum):
     PUMP_DRIVE = 4
 
 
-DELIVERY_STATE = "delivery.supply"
-ADDED_DELIVERY_STATE = "added_delivery.supply"
+DELIVERY_STATE = "delivery"
+ADDED_DELIVERY_STATE = "added_delivery"
 ACTUATOR_MARKER = 215325.0  # arbitrary value of actuator_user[0] that marks hydrotele's actuators
 
 
@@ -166,18 +176,16 @@ def extra_state_names(machine: Machine) -> list[str]:
     """Return the names of the additional states after the activations of the hydraulic axes.
 
     In this order: `bristle.<axis>` for every hydraulic axis with presliding friction,
-    `delivery.supply` for a pump with a time constant, `added_delivery.supply` if terms add to the
-    pump flow, `memory.term_<k>` for every term with hysteresis, and `bristle.<axis>` for the force
+    `delivery.<pump>` for every pump with a time constant, `added_delivery.<pump>` if terms add to
+    its flow, `memory.term_<k>` for every term with hysteresis, and `bristle.<axis>` for the force
     drives. Most machines have none.
     """
-    supply, rubbing = machine.supply, [
-        n for n in actuator_order(machine) if machine.axes[n].drive.friction.has_presliding
-    ]  # fmt: skip
+    rubbing = [n for n in actuator_order(machine) if machine.axes[n].drive.friction.has_presliding]
     names = [f"bristle.{n}" for n in rubbing if machine.axes[n].is_hydraulic]
-    if supply and supply.time_constant and machine.valve_axes:
-        names.append(DELIVERY_STATE)
-    if any(term.balance == "flow_supply" for term in machine.terms):
-        names.append(ADDED_DELIVERY_STATE)
+    if machine.valve_axes:
+        names += [f"{DELIVERY_STATE}.{name}" for name, pump in machine.pumps.items() if pump.time_constant]
+    added_to = {machine.pump_of(term.axis) for term in machine.terms if term.balance == "flow_supply"}
+    names += [f"{ADDED_DELIVERY_STATE}.{name}" for name in machine.pumps if name in added_to]
     names += [f"memory.term_{k + 1}" for k in range(len(terms_with_hysteresis(machine.terms)))]
     return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].is_hydraulic]
 
@@ -206,11 +214,9 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
             numbers[Slot.BRISTLE_STIFFNESS] = axis.drive.friction.presliding_stiffness
             numbers[Slot.BRISTLE_DAMPING] = axis.drive.friction.presliding_damping
             numbers[Slot.BRISTLE] = memory[f"bristle.{name}"]
-        if DELIVERY_STATE in memory and axis.valve and machine.supply:
-            numbers[Slot.PUMP_TIME_CONSTANT] = machine.supply.time_constant
-            numbers[Slot.DELIVERY] = memory[DELIVERY_STATE]
-        if ADDED_DELIVERY_STATE in memory and axis.valve:
-            numbers[Slot.ADDED_DELIVERY] = memory[ADDED_DELIVERY_STATE]
+        numbers[Slot.GROUP_SIZE] = count if axis.is_hydraulic else 0
+        if axis.valve:
+            _write_pump_group(numbers, machine, name, memory)
         _write_friction(numbers, axis)
         _write_end_stop(numbers, machine, name)
         if axis.transmission:
@@ -218,7 +224,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
         if axis.pump:
             _write_pump_drive(numbers, machine, name)
         elif axis.is_hydraulic and machine.supply:
-            _write_valve_axis(numbers, axis, machine.supply)
+            _write_valve_axis(numbers, axis, machine.pumps[machine.pump_of(name)])
         else:
             numbers[Slot.KIND] = ActuatorKind.FORCE
             numbers[Slot.OFFSET] = axis.force.offset if axis.force else 0.0
@@ -318,6 +324,39 @@ def _write_valve_axis(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     numbers[Slot.RELIEF_OVERRIDE] = supply.relief_override
     if supply.kind == "load_sensing":
         numbers[Slot.LOAD_SENSING_MARGIN] = supply.load_sensing_margin
+
+
+def _write_pump_group(numbers: np.ndarray, machine: Machine, name: str, states: dict[str, int]) -> None:
+    """Write states, axes, priority and merging valve of an axis' pump to its parameters (SLOT_COUNT,).
+
+    `states` are the indices of the additional states by name.
+    """
+    pump = machine.pump_of(name)
+    if f"{DELIVERY_STATE}.{pump}" in states:
+        numbers[Slot.PUMP_TIME_CONSTANT] = machine.pumps[pump].time_constant
+        numbers[Slot.DELIVERY] = states[f"{DELIVERY_STATE}.{pump}"]
+    if f"{ADDED_DELIVERY_STATE}.{pump}" in states:
+        numbers[Slot.ADDED_DELIVERY] = states[f"{ADDED_DELIVERY_STATE}.{pump}"]
+    if machine.engine:
+        numbers[Slot.ENGINE_POWER] = machine.engine.power * machine.engine.efficiency
+    if not machine.supplies:
+        return
+    group, order = machine.supplies[pump], list(machine.hydraulic_axes)
+    pumped = len(order) - len(machine.valve_axes) if pump == list(machine.supplies)[-1] else 0
+    numbers[Slot.GROUP_SIZE] = len(group.axes) + pumped  # axes with their own pump follow the last group
+    if group.priority:
+        valve = machine.axes[group.priority].valve
+        assert valve
+        numbers[Slot.PRIORITY_DROP] = valve.compensator_pressure_drop or valve.rated_pressure_drop
+    if name in machine.merging:
+        valve = machine.merging[name]
+        ends = [order.index(machine.axes_of_pump(end)[0]) for end in (valve.from_supply, valve.to_supply)]
+        numbers[Slot.MERGE_FROM], numbers[Slot.MERGE_TO] = ends
+        first, count = int(Slot.MERGE_CURVE), len(valve.travel)
+        numbers[first] = count
+        numbers[first + 1 : first + 1 + count] = valve.travel
+        share = np.clip(valve.share_scale * np.array(valve.share), 0.0, 1.0)
+        numbers[first + 1 + CURVE_KNOTS : first + 1 + CURVE_KNOTS + count] = share
 
 
 def _write_pump_drive(numbers: np.ndarray, machine: Machine, name: str) -> None:

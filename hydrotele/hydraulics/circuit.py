@@ -1,9 +1,9 @@
-"""Time step of the hydraulic circuit: several valves and chambers with one shared supply.
+"""Time step of the hydraulic circuit: valves and chambers with one or more shared supplies.
 
 Pure functions on flat arrays in MuJoCo's layout, so that the native callbacks, the tests and the
 estimator run the same code. The parameters of axis `i` are at `user[i * SLOT_COUNT + Slot]`. Its
 activations `spool, spool_rate, p_head, p_rod` are at `act[4 i ...]`, counted from the first
-hydraulic axis. The states of bristles, of a pump with a time constant and of terms follow after all
+hydraulic axis. The states of bristles, of pumps with a time constant and of terms follow after all
 axes. An axis with its own pump (`ActuatorKind.PUMP_DRIVE`, see `pump_drive`) has pump speed and
 load cylinder pressure instead of spool and spool rate.
 
@@ -42,16 +42,31 @@ from hydrotele.hydraulics.pump_drive import (
     pump_speed_step,
 )
 from hydrotele.hydraulics.supply import (
+    BLOCK_SIZE,
+    DEMAND,
+    FACTOR_OFFSET,
+    FEED,
+    FRACTION,
+    IS_COUPLED,
+    MAX_AXES,
+    PUMP_ADDED,
+    PUMP_START,
+    SCRATCH_SIZE,
+    STAGE_OFFSET,
     TERM_FLOW_TIME_CONSTANT,
     add_flow_fractions,
     advance_pump_flow_fraction,
     circuit_supply_pressure,
     compute_inlet_conditions,
-    compute_supply_pressure_derivatives,
     delivered_flow_fraction,
-    demanded_flow_fraction,
+    group_size,
     pump_flow_fraction,
+    solve_state_supplies,
     solve_supply_pressure,
+    solve_supply_pressures,
+    write_delivered_fractions,
+    write_demanded_fractions,
+    write_supply_couplings,
 )
 from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
 from hydrotele.terms.drive_state import VARIABLES, DriveState
@@ -75,18 +90,11 @@ __all__ = [
     "actuator_friction_slope", "actuator_end_stop_force", "axis_valve_opening", "axis_flows_and_force", "chamber_flows",
     "circuit_scratch", "circuit_supply_pressure", "delivered_flow_fraction", "force_after_friction",
     "compute_inlet_conditions", "chamber_pressure_rates", "pump_drive_force", "step_circuit", "solve_supply_pressure",
-    "demanded_flow_fraction",
+    "FEED", "group_size", "solve_state_supplies", "write_demanded_fractions",
 ]  # fmt: skip
 
 ACTIVATIONS_PER_AXIS = 4
 NO_EXTRA_STATES = -1  # value of `memory` that skips all code of additional states
-MAX_AXES = 8
-# Layout of the work space: ports, factors of pressures and supply coupling, then the softening of
-# both chambers, later replaced by their rates of the first stage.
-_FACTOR_OFFSET = 4 * MAX_AXES
-_STAGE_OFFSET = 8 * MAX_AXES
-SCRATCH_SIZE = 10 * MAX_AXES
-
 _ROS2_GAMMA = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NO_FLOWS = (0.0, 0.0, 0.0, 0.0)
 
@@ -202,26 +210,27 @@ def _term_flows(terms, i, user, time, x, oil, supply, drives):
 
 
 @compile_without_allocation
-def _term_flow_fraction(user, first, drives, terms, time, supply, dt):
-    """Return the flow that terms add to the supply at the end of a step, per maximum pump flow [1].
+def _term_flow_fraction(user, first, k, drives, terms, time, scratch, dt):
+    """Return the flow that terms add to a pump at the end of a step, per maximum pump flow [1].
 
-    Terms are additional laws of a machine. The flow follows the sum of the terms at the start of
-    the step with a first-order lag of 20 ms. It is 0 for a machine without such terms.
+    Terms are additional laws of a machine; those of the axes of the pump count, whose first axis is
+    k. The flow follows the sum of the terms at the start of the step with a first-order lag of
+    20 ms. It is 0 for a pump without such terms.
     """
-    at = int(user[first * SLOT_COUNT + _ADDED])
+    at = int(user[(first + k) * SLOT_COUNT + _ADDED])
     if at == 0:
         return 0.0
     total, act = 0.0, drives.act
     if has_term(terms, FLOW_SUPPLY, ANY_DRIVE):
-        for i in range(drives.count):
+        for i in range(k, k + group_size(user, first, drives.count, k)):
             u, a, v = (first + i) * SLOT_COUNT, 4 * i, drives.velocity[first + i]
             force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
             s = DriveState(
                 time, drives.position[first + i] - dt * v, v, act[a], act[a + 1], act[a + 2],
-                act[a + 3], supply, drives.command[first + i], force, 0.0, 0.0,
+                act[a + 3], scratch[FEED + i], drives.command[first + i], force, 0.0, 0.0,
             )  # fmt: skip
             total += sum_terms(terms, FLOW_SUPPLY, first + i, s, drives)
-    wanted = total / user[first * SLOT_COUNT + _PUMP]
+    wanted = total / user[(first + k) * SLOT_COUNT + _PUMP]
     return wanted + (act[at] - wanted) * math.exp(-dt / TERM_FLOW_TIME_CONSTANT)
 
 
@@ -233,8 +242,9 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
 
     Spools follow their exact exponential. Pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
-    except for the supply, which couples all fed chambers (`compute_supply_pressure_derivatives`,
-    solved by the Sherman-Morrison formula). The supply pressure is solved in both stages. Below
+    except for the supplies, each of which couples the chambers that it feeds
+    (`compute_supply_pressure_derivatives`, solved by the Sherman-Morrison formula). The supply
+    pressures are solved in both stages. Below
     atmosphere the method integrates the pressure P without released air
     (`laws.pressure_without_released_air`), which is linear in the missing oil volume. A pump with a
     time constant follows the mean of the flow demands at both ends of the step, by its exact
@@ -251,14 +261,15 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         dt: time step, scalar [s].
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
             [s]; of the additional states only those of the pump.
-        scratch: (SCRATCH_SIZE,) work space.
+        scratch: (SCRATCH_SIZE,) work space. At FEED it then has the pressure that feeds each axis at
+            the end of the step [Pa].
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: time at the start of the step, scalar [s]; used by terms only.
         extra_states: number of additional states after the activations, scalar [1];
             `NO_EXTRA_STATES` skips them and saves the time of the check.
 
     Returns:
-        (supply pressure at the start of the step [Pa], at its end [Pa]).
+        (pressure of the first supply at the start of the step [Pa], at its end [Pa]).
 
     Source: models/cat215/README.md; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
     """
@@ -275,15 +286,15 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
     compute_inlet_conditions(user, act, act, scratch, first, count, 0.0, act_dot)
-    held, share, begun, more_delivered = 1.0, 1.0, 0.0, 0.0
+    for k in range(count):
+        scratch[FRACTION + k] = 1.0
     if extra_states >= 0:
-        held = delivered_flow_fraction(user, first, act)
-    p_start = circuit_supply_pressure(user, first, count, scratch, held)
+        write_delivered_fractions(user, first, count, act, scratch)
+    solve_supply_pressures(user, first, count, scratch)
+    p_start = scratch[FEED]
+    write_supply_couplings(user, first, count, scratch)
     if extra_states >= 0:
-        begun = demanded_flow_fraction(user, first, count, scratch)
-        more_delivered = _term_flow_fraction(user, first, drives, terms, time, p_start, dt)
-        share = advance_pump_flow_fraction(user, first, begun, pump_flow_fraction(user, first, act), dt)
-        share = add_flow_fractions(share, more_delivered)
+        _advance_pump_fractions(user, first, drives, terms, time, scratch, dt)
     for i in range(count):
         u, a = (first + i) * SLOT_COUNT, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
@@ -292,35 +303,33 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         more = _NO_FLOWS
         if len(terms) > 0:
             oil = (act[a], act[a + 1], act[a + 2], act[a + 3])
-            more = _term_flows(terms, first + i, user, time, x, oil, p_start, drives)
+            more = _term_flows(terms, first + i, user, time, x, oil, scratch[FEED + i], drives)
         head, rod, j_head, j_rod = chamber_pressure_rates(
-            user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
+            user, u, scratch[a + 3], scratch[FEED + i], act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
-        f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
+        f, k = FACTOR_OFFSET + a, STAGE_OFFSET + 2 * i
         scratch[k] = _predicted_softening(user, u, act[a + 2], head, dt)
         scratch[k + 1] = _predicted_softening(user, u, act[a + 3], rod, dt)
         scratch[f] = 1.0 / (1.0 - gamma_h * (scratch[k] * j_head))
         scratch[f + 1] = 1.0 / (1.0 - gamma_h * (scratch[k + 1] * j_rod))
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
-    coupled = compute_supply_pressure_derivatives(user, first, count, scratch, p_start, scratch[_FACTOR_OFFSET:])
-    if coupled:
-        _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
-        _apply_supply_coupling(count, act_dot, scratch)
+    k = 0
+    while k < count:
+        size = int(scratch[BLOCK_SIZE + k])
+        if scratch[IS_COUPLED + k] > 0.0:
+            _prepare_supply_coupling(user, first, k, size, drives, dt, gamma_h, scratch)
+            _apply_supply_coupling(k, size, act_dot, scratch)
+        k += size
     for i in range(count):
-        u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
+        u, a, k = (first + i) * SLOT_COUNT, 4 * i, STAGE_OFFSET + 2 * i
         scratch[k], scratch[k + 1] = act_dot[a + 2], act_dot[a + 3]
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], act_dot[a + 2], dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], act_dot[a + 3], dt)
     compute_inlet_conditions(user, act, act_dot, scratch, first, count, dt, act_dot)
-    p_end = circuit_supply_pressure(user, first, count, scratch, share)
+    solve_supply_pressures(user, first, count, scratch)
+    p_end = scratch[FEED]
     if extra_states >= 0:
-        if user[first * SLOT_COUNT + _LAG] > 0.0:
-            at = int(user[first * SLOT_COUNT + _DELIVERY])
-            wanted = 0.5 * (begun + demanded_flow_fraction(user, first, count, scratch))
-            act_dot[at] = (advance_pump_flow_fraction(user, first, wanted, act[at], dt) - act[at]) / dt
-        if user[first * SLOT_COUNT + _ADDED] > 0.0:
-            at = int(user[first * SLOT_COUNT + _ADDED])
-            act_dot[at] = (more_delivered - act[at]) / dt
+        _write_pump_rates(user, first, count, act, act_dot, scratch, dt)
     for i in range(count):
         u, a = (first + i) * SLOT_COUNT, 4 * i
         x, v = length[first + i], velocity[first + i]
@@ -328,19 +337,23 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         more = _NO_FLOWS
         if len(terms) > 0:
             oil = (act_dot[a], act_dot[a + 1], p_head, p_rod)
-            more = _term_flows(terms, first + i, user, time + dt, x, oil, p_end, drives)
+            more = _term_flows(terms, first + i, user, time + dt, x, oil, scratch[FEED + i], drives)
         head, rod, _, _ = chamber_pressure_rates(
-            user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
+            user, u, scratch[a + 3], scratch[FEED + i], p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
-        f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
+        f, k = FACTOR_OFFSET + a, STAGE_OFFSET + 2 * i
         act_dot[a + 2] = scratch[f] * (head - 2.0 * scratch[k])
         act_dot[a + 3] = scratch[f + 1] * (rod - 2.0 * scratch[k + 1])
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
-    if coupled:
-        _apply_supply_coupling(count, act_dot, scratch)
+    k = 0
+    while k < count:
+        size = int(scratch[BLOCK_SIZE + k])
+        if scratch[IS_COUPLED + k] > 0.0:
+            _apply_supply_coupling(k, size, act_dot, scratch)
+        k += size
     for i in range(count):
-        u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
+        u, a, k = (first + i) * SLOT_COUNT, 4 * i, STAGE_OFFSET + 2 * i
         head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
         rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
         port = user[u + _PORT]
@@ -356,7 +369,42 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
 
 
 @compile_without_allocation
-def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
+def _advance_pump_fractions(user, first, drives, terms, time, scratch, dt):
+    """Write the fractions of all pumps at the end of a step to FRACTION, and what leads to them.
+
+    PUMP_START gets the demand at the start of the step, PUMP_ADDED the fraction that terms add at
+    its end. The arguments are those of `step_circuit`.
+    """
+    count, act, k = drives.count, drives.act, 0
+    write_demanded_fractions(user, first, count, scratch)
+    while k < count:
+        begun = scratch[DEMAND + k]
+        added = _term_flow_fraction(user, first, k, drives, terms, time, scratch, dt)
+        share = advance_pump_flow_fraction(user, first + k, begun, pump_flow_fraction(user, first + k, act), dt)
+        scratch[PUMP_START + k], scratch[PUMP_ADDED + k] = begun, added
+        scratch[FRACTION + k] = add_flow_fractions(share, added)
+        k += group_size(user, first, count, k)
+
+
+@compile_without_allocation
+def _write_pump_rates(user, first, count, act, act_dot, scratch, dt):
+    """Write the mean rates of the states of all pumps over a step; arguments as of `step_circuit`."""
+    write_demanded_fractions(user, first, count, scratch)
+    k = 0
+    while k < count:
+        s = (first + k) * SLOT_COUNT
+        if user[s + _LAG] > 0.0:
+            at = int(user[s + _DELIVERY])
+            wanted = 0.5 * (scratch[PUMP_START + k] + scratch[DEMAND + k])
+            act_dot[at] = (advance_pump_flow_fraction(user, first + k, wanted, act[at], dt) - act[at]) / dt
+        if user[s + _ADDED] > 0.0:
+            at = int(user[s + _ADDED])
+            act_dot[at] = (scratch[PUMP_ADDED + k] - act[at]) / dt
+        k += group_size(user, first, count, k)
+
+
+@compile_without_allocation
+def write_term_state_rates(user, terms, drives, act_dot, dt, time, feed):
     """Write the mean rates over a step of the internal states of terms with hysteresis.
 
     Call this function after the rates of all other activations have been written, since it uses
@@ -371,7 +419,7 @@ def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
             written [1/s].
         dt: time step, scalar [s].
         time: time at the start of the step, scalar [s].
-        supply: supply pressure at the end of the step, scalar [Pa].
+        feed: (>= count,) pressures that feed the axes at the end of the step [Pa].
 
     Returns:
         Nothing.
@@ -393,7 +441,7 @@ def write_term_state_rates(user, terms, drives, act_dot, dt, time, supply):
         elif k == _COMMAND:
             value = drives.command[i]
         elif k == _SUPPLY:
-            value = supply
+            value = feed[min(i, count - 1)]
         elif i >= count:
             value = 0.0
         elif k == _FORCE:
@@ -457,8 +505,8 @@ def _predicted_softening(user, u, pressure, rate, dt):
 
 
 @compile_without_allocation
-def _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
-    """Prepare the Sherman-Morrison solution of the stage equations that the supply couples.
+def _prepare_supply_coupling(user, first, begin, size, drives, dt, gamma_h, scratch):
+    """Prepare the Sherman-Morrison solution of the stage equations that the supply of some axes couples.
 
     The stage equations of ROS2 are `(I - gamma h (D + b w^T)) k = r` for the pressure rates k, with step h
     and coefficient gamma. D is diagonal, b the pressure rates per supply pressure and w = dp_s/dp. Index 2
@@ -466,37 +514,38 @@ def _prepare_supply_coupling(user, first, count, act, length, velocity, dt, gamm
     divisor `1 - gamma h w^T b / (1 - gamma h D)`, negative if the rod side is fed. Index 3 gets w times
     the softening of the fed chamber by released air.
     """
-    divisor = 1.0
-    for i in range(count):
-        f = _FACTOR_OFFSET + 4 * i
+    divisor, act = 1.0, drives.act
+    for i in range(begin, begin + size):
+        f = FACTOR_OFFSET + 4 * i
         if scratch[f + 2] == 0.0:
             continue
         head, rod = _chamber_stiffness(
-            user, (first + i) * SLOT_COUNT, length[first + i] - dt * velocity[first + i],
+            user, (first + i) * SLOT_COUNT, drives.position[first + i] - dt * drives.velocity[first + i],
             act[4 * i + 2], act[4 * i + 3],
         )  # fmt: skip
         own = gamma_h * scratch[f + 2]
         own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
-        k = _STAGE_OFFSET + 2 * i
+        k = STAGE_OFFSET + 2 * i
         scratch[f + 3] *= scratch[k] if scratch[4 * i + 3] > 0.0 else scratch[k + 1]
         divisor -= scratch[f + 3] * own
         scratch[f + 2] = own if scratch[4 * i + 3] > 0.0 else -own
-    for f in range(_FACTOR_OFFSET, _FACTOR_OFFSET + 4 * count, 4):
+    for f in range(FACTOR_OFFSET + 4 * begin, FACTOR_OFFSET + 4 * (begin + size), 4):
         scratch[f + 2] /= divisor
 
 
 @compile_inlined
-def _apply_supply_coupling(count, rate, scratch):
+def _apply_supply_coupling(begin, size, rate, scratch):
     """Correct the stage rates of uncoupled chambers for the coupling through the supply, in place.
 
-    It applies the Sherman-Morrison factors of `_prepare_supply_coupling` to `rate` (4 count,).
+    It applies the Sherman-Morrison factors of `_prepare_supply_coupling` to `rate` (4 count,), for
+    the `size` axes of a pump from index `begin` on.
     """
     pull = 0.0
-    for a in range(0, 4 * count, 4):
-        f = _FACTOR_OFFSET + a
+    for a in range(4 * begin, 4 * (begin + size), 4):
+        f = FACTOR_OFFSET + a
         pull += scratch[f + 3] * rate[a + 2 if scratch[f + 2] > 0.0 else a + 3]
-    for a in range(0, 4 * count, 4):
-        f = _FACTOR_OFFSET + a
+    for a in range(4 * begin, 4 * (begin + size), 4):
+        f = FACTOR_OFFSET + a
         if scratch[f + 2] > 0.0:
             rate[a + 2] += scratch[f + 2] * pull
         else:
@@ -650,10 +699,9 @@ def add_command_terms(user, terms, drives, dt, time, scratch, out):
         for i in range(count):
             out[i] = command[i]
         return
-    compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
-    supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
+    solve_state_supplies(user, 0, count, act, scratch)
     middle = time + 0.5 * dt
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]
-        s = make_drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
+        s = make_drive_state(user, i, count, act, scratch[FEED + i], middle, x, velocity[i], command[i], 0.0)
         out[i] = command[i] + sum_terms(terms, COMMAND, i, s, drives)

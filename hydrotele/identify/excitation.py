@@ -408,28 +408,28 @@ class MachineLimits:
         found = self.setup.project_motion_on_drives(*clipped)
         table = replace(self.setup, offsets=None).compute_regressor(found)
         forces = table.matrix @ table.nominal
-        flow = np.zeros(len(forces))
+        flow = {pump: np.zeros(len(forces)) for pump in self.machine.pumps}
         for i, axis in enumerate(self.axes):
             parts.append(self._drive_utilisation(axis, i, found, forces[:, i], flow)[:, None])
-        supply = self.machine.supply
-        if supply is not None:
-            parts.append(flow[:, None] / (_MAX_FLOW_FRACTION * supply.pump_flow))
+        for pump, drawn in flow.items():
+            parts.append(drawn[:, None] / (_MAX_FLOW_FRACTION * self.machine.pumps[pump].pump_flow))
         return np.concatenate(parts, axis=1)
 
     def _drive_utilisation(
-        self, axis: str, i: int, projection: Projection, force: np.ndarray, flow: np.ndarray
+        self, axis: str, i: int, projection: Projection, force: np.ndarray, flow: dict[str, np.ndarray]
     ) -> np.ndarray:
         """Return the largest utilisation (n,) of a drive's force, valve flow and stroke limits at each row.
 
-        It is 1 at the limit. The drive's flow is added to `flow` (n,) [m^3/s] in place.
+        It is 1 at the limit. The drive's flow is added to that of its pump in `flow`, name ->
+        (n,) [m^3/s], in place.
         """
-        facts, supply = self.machine.axes[axis], self.machine.supply
-        j = self.drives[i]
-        assert supply is not None and facts.valve is not None
+        facts, pump, j = self.machine.axes[axis], self.machine.pump_of(axis), self.drives[i]
+        supply = self.machine.pumps[pump]
+        assert facts.valve is not None
         head, rod = facts.hydraulic_drive.effective_areas
         speed = projection.rate[:, j]
         taken = np.where(speed > 0.0, head * speed, -rod * speed)
-        flow += taken
+        flow[pump] += taken
         reach = np.where(force > 0.0, head, rod) * (supply.relief_pressure - supply.tank_pressure)
         used = np.maximum(
             np.abs(force) / (_MAX_FORCE_FRACTION * reach),

@@ -132,7 +132,8 @@ def _propose(column: str, kind: str, unit: str | None, low: float, high: float, 
         return Proposal(column, None, None, None, 0.0, f"{missing} not recognised, {span}")
     if found == "angle" and machine and axis in machine.axes:
         found = machine.position_kind(axis)
-    channel = found if found == "pressure_supply" else f"{found}.{axis}"
+    pump = next((name for name in (machine.supplies if machine else ()) if name in words), "")
+    channel = f"{found}.{pump if found == 'pressure_supply' else axis}".removesuffix(".")
     stated, sure_unit, why = _find_unit(channel, words, kind, unit, low, high)
     parts = [sure_kind, sure_unit] if found == "pressure_supply" else [sure_axis, sure_kind, sure_unit]
     estimated = [name for name, sure in (("axis", sure_axis), ("kind", sure_kind)) if 0.0 < sure < 1.0]

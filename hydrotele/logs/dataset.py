@@ -51,7 +51,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
         *(f"length.{name}" for name in order if machine.axes[name].cylinder),
         *(f"pressure_head.{name}" for name in valves),
         *(f"pressure_rod.{name}" for name in valves),
-        *(("pressure_supply",) if machine.supply and valves else ()),
+        *(machine.supply_channels if machine.supply and valves else ()),
     )
 
 

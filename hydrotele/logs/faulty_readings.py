@@ -47,8 +47,9 @@ def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
     if kind.startswith("pressure"):
         if machine.supply is None:  # axes with individual pumps have no stated limit
             return _MIN_PRESSURE_READING, math.inf
+        mains = [pump.relief_pressure for pump in machine.pumps.values()]
         reliefs = [a.valve.port_relief for a in machine.hydraulic_axes.values() if a.valve]
-        return _MIN_PRESSURE_READING, _MAX_PRESSURE_RATIO * max(machine.supply.relief_pressure, *reliefs)
+        return _MIN_PRESSURE_READING, _MAX_PRESSURE_RATIO * max(*mains, *reliefs)
     if kind == "length":
         cylinder = machine.axes[axis].cylinder
         assert cylinder

@@ -19,7 +19,7 @@ _GROUPS = (
         re.compile(r"axes\..*\.(base_pin|rod_pin|closed_length|stroke)|links\..*\.position|closures"),
     ),
     ("bores, rods and motors", re.compile(r"axes\..*\.(bore|rod_diameter|area_|count|displacement)")),
-    ("pump and relief valve", re.compile(r"supply\.")),
+    ("pump and relief valve", re.compile(r"(supply|supplies|merging|engine)\.")),
     ("masses", re.compile(r"links\.")),
     ("valves", re.compile(r"axes\..*\.valve")),
     ("friction, volumes, leakage, cylinder masses", re.compile(r"axes\.")),

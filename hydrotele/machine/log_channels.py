@@ -1,6 +1,7 @@
 """Channel names of logs and their units.
 
-A channel name is `kind.axis` (`angle.boom`) or a bare `kind` (`time`, `pressure_supply`). Channels
+A channel name is `kind.axis` (`angle.boom`) or a bare `kind` (`time`, `pressure_supply`). With
+several pumps the pressure of each has its name (`pressure_supply.front`). Channels
 that only a simulator knows start with `truth.` (`truth.flow_head.boom`). Axis names are arbitrary
 lower-case identifiers. Every channel has one float64 per row, shape (n,), in a SI unit of its kind.
 """
@@ -23,7 +24,7 @@ class ChannelKind(NamedTuple):
         units: allowed SI units, the usual one first.
         description: meaning of the values.
         axes: "free" for `kind.axis` with any axis name, "xyz" for `kind.x`, `.y` and `.z`, "none"
-            for a bare name.
+            for a bare name, "optional" for a bare name or `kind.pump` with the name of a pump.
     """
 
     units: tuple[str, ...]
@@ -65,7 +66,7 @@ MEASURED_KINDS: Mapping[str, ChannelKind] = {
     "force": ChannelKind(("N",), "force along a prismatic joint"),
     "pressure_head": ChannelKind(("Pa",), "head side chamber, or port A of a motor"),
     "pressure_rod": ChannelKind(("Pa",), "rod side chamber, or port B of a motor"),
-    "pressure_supply": ChannelKind(("Pa",), "pump or supply pressure", "none"),
+    "pressure_supply": ChannelKind(("Pa",), "pump or supply pressure", "optional"),
     "pressure_ls": ChannelKind(("Pa",), "load-sensing pressure: the highest pressure of a fed chamber", "none"),
     "pilot_pressure_a": ChannelKind(("Pa",), "pilot pressure for positive commands of an axis"),
     "pilot_pressure_b": ChannelKind(("Pa",), "pilot pressure for negative commands of an axis"),
@@ -91,12 +92,12 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
     "spool": ChannelKind(("1",), "spool position relative to its stroke"),
     "spool_rate": ChannelKind(("1/s",), "spool speed relative to the stroke"),
     "bristle": ChannelKind(("1",), "friction force of the bristles relative to the breakaway force"),
-    "delivery": ChannelKind(("1",), "flow setting of the pump relative to its largest flow", "none"),
-    "added_delivery": ChannelKind(("1",), "flow added by terms relative to the largest flow", "none"),
+    "delivery": ChannelKind(("1",), "flow setting of the pump relative to its largest flow", "optional"),
+    "added_delivery": ChannelKind(("1",), "flow added by terms relative to the largest flow", "optional"),
     "memory": ChannelKind(("1",), "internal state of a term: backlash over half width, or relay 0 to 1"),
     "flow_head": ChannelKind(("m^3/s",), "valve flow into the head side chamber"),
     "flow_rod": ChannelKind(("m^3/s",), "valve flow into the rod side chamber"),
-    "flow_supply": ChannelKind(("m^3/s",), "pump flow", "none"),
+    "flow_supply": ChannelKind(("m^3/s",), "flow of the valves of a pump", "optional"),
     "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
     "contact_force": ChannelKind(("N",), "contact force of ground and objects on the machine, world frame", "xyz"),
@@ -161,7 +162,7 @@ def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tup
 
 def valid_channel_patterns() -> tuple[str, ...]:
     """Return the forms of all valid channel names, such as `angle.<axis>`, measured channels first."""
-    endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": ""}
+    endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": "", "optional": "[.<pump>]"}
     measured = [kind + endings[spec.axes] for kind, spec in MEASURED_KINDS.items()]
     return tuple(measured + [_TRUTH_PREFIX + kind + endings[spec.axes] for kind, spec in TRUTH_KINDS.items()])
 
@@ -183,7 +184,7 @@ def parse_channel(name: str) -> Channel:
         raise ValueError(_unknown_channel_message(name))
     if spec.axes == "none" and dot:
         raise ValueError(f"{kind} has no axis: write {channel_name(kind, truth=truth)}")
-    if spec.axes == "free" and not _AXIS_PATTERN.fullmatch(axis):
+    if (spec.axes == "free" or (spec.axes == "optional" and dot)) and not _AXIS_PATTERN.fullmatch(axis):
         example = channel_name(kind, "boom", truth=truth)
         raise ValueError(f"{kind} needs an axis in lower case, such as {example}, got {name!r}")
     if spec.axes == "xyz" and axis not in ("x", "y", "z"):
@@ -243,7 +244,7 @@ def suggest_channel_names(name: str, present: Iterable[str] = ()) -> list[str]:
             return [channel_name(kind, words[0].removeprefix(kind + "_"), truth=truth)]
     candidates = list(present)
     for kind, spec in kinds.items():
-        axes = {"free": words or ["boom"], "xyz": ["x", "y", "z"], "none": [""]}[spec.axes]
+        axes = {"free": words or ["boom"], "xyz": ["x", "y", "z"], "none": [""], "optional": ["", *words]}[spec.axes]
         candidates += channel_names(kind, axes, truth=truth)
     return difflib.get_close_matches(plain, dict.fromkeys(candidates), n=3, cutoff=0.6)
 

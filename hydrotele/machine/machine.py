@@ -153,6 +153,64 @@ class Supply(StrictModel):
         return self
 
 
+class PumpGroup(StrictModel):
+    """One of several pumps and the axes that it feeds; a value that is None is that of `supply`.
+
+    The axis `priority` keeps the rated pressure drop of its valve before the other axes receive
+    flow. The other values are described in `Supply`.
+    """
+
+    axes: Annotated[tuple[Name, ...], Field(min_length=1)]
+    priority: Name | None = None
+    kind: Literal["constant_flow", "load_sensing", "constant_pressure"] | None = None
+    relief_pressure: PositiveFloat | None = None
+    pump_flow: PositiveFloat | None = None
+    pump_droop: NonNegativeFloat | None = None
+    relief_override: NonNegativeFloat | None = None
+    load_sensing_margin: PositiveFloat | None = None
+    time_constant: NonNegativeFloat | None = None
+
+    @model_validator(mode="after")
+    def _check(self):
+        if self.priority is not None:
+            _check_name_is_known(self.priority, self.axes, "priority")
+        return self
+
+
+class MergingValve(StrictModel):
+    """A valve that moves a share of the flow of pump `from_supply` to the line of pump `to_supply`.
+
+    The spool of the axis whose name is the key in `Machine.merging` shifts it, as one pilot pressure
+    shifts both. `share` [1] is linear in the spool position `travel` [1] between 2 to 8 knots, and
+    constant beyond them. A faulty valve moves `share_scale` times this share.
+    """
+
+    from_supply: Name
+    to_supply: Name
+    travel: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(min_length=2, max_length=8)]
+    share: tuple[Annotated[float, Field(ge=0.0, le=1.0)], ...]
+    share_scale: Annotated[float, Field(ge=0.0)] = 1.0
+
+    @model_validator(mode="after")
+    def _check(self):
+        if len(self.share) != len(self.travel) or np.any(np.diff(self.travel) <= 0.0):
+            raise ValueError("needs as many values of share as of travel, and travel must increase")
+        if self.from_supply == self.to_supply:
+            raise ValueError("from_supply and to_supply must be different pumps")
+        return self
+
+
+class Engine(StrictModel):
+    """The engine that drives all pumps: `power` [W], and `efficiency` [1] from engine to oil.
+
+    If the hydraulic power of all pumps exceeds `efficiency * power`, one common factor reduces the
+    flows of all pumps.
+    """
+
+    power: PositiveFloat
+    efficiency: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+
+
 class Arm(StrictModel):
     """Names of the joints of an arm from swing over boom and stick to tool and head, and its tip.
 
@@ -179,10 +237,13 @@ class Machine(StrictModel):
 
     `mjcf` and `attached` files are relative to `folder`. `attached` maps the name of a body of
     `mjcf` to an MJCF file whose bodies are attached to it; `removed_bodies` are the bodies of
-    unused tools. `sensed_joints` are the joints with the angle sensors of a calibrator, starting at
-    the machine. `home` are the joint positions at home [rad] or [m]. `loads` are the load cylinders
-    of pump axes. `log_columns` maps columns of log files to channels. `uncertainty` are standard
-    deviations of parameters by name. `terms` are additional force, flow and command laws.
+    unused tools. `supply` is the pump and the oil; with several pumps, `supplies` are the pumps by
+    name, `merging` the merging valves by the axis that shifts them, and `supply` the oil and the
+    values that the pumps share. `engine` limits the power of all pumps. `sensed_joints` are the
+    joints with the angle sensors of a calibrator, starting at the machine. `home` are the joint
+    positions at home [rad] or [m]. `loads` are the load cylinders of pump axes. `log_columns` maps
+    columns of log files to channels. `uncertainty` are standard deviations of parameters by name.
+    `terms` are additional force, flow and command laws.
     """
 
     name: Name
@@ -199,6 +260,9 @@ class Machine(StrictModel):
     sensed_joints: tuple[Name, ...] = ()
     closures: dict[Name, Closure] = {}
     supply: Supply | None = None
+    supplies: dict[Name, PumpGroup] = {}
+    merging: dict[Name, MergingValve] = {}
+    engine: Engine | None = None
     loads: dict[Name, LoadCylinder] = {}
     oil: Oil | None = None
     sensors: dict[Name, SensorSet] = {}
@@ -240,13 +304,44 @@ class Machine(StrictModel):
 
     @property
     def hydraulic_axes(self) -> dict[str, Axis]:
-        """Axes with a valve or an individual pump."""
-        return {name: axis for name, axis in self.axes.items() if axis.is_hydraulic}
+        """Axes with a valve or an individual pump.
+
+        With several pumps, the axes of a pump follow one another, that with priority first.
+        """
+        found = {name: axis for name, axis in self.axes.items() if axis.is_hydraulic}
+        order = [n for g in self.supplies.values() for n in sorted(g.axes, key=lambda a: a != g.priority)]
+        return {**{name: found[name] for name in order if name in found}, **found}
 
     @property
     def valve_axes(self) -> dict[str, Axis]:
-        """Axes with a valve."""
-        return {name: axis for name, axis in self.axes.items() if axis.valve}
+        """Axes with a valve, in the order of `hydraulic_axes`."""
+        return {name: axis for name, axis in self.hydraulic_axes.items() if axis.valve}
+
+    @property
+    def pumps(self) -> dict[str, Supply]:
+        """Pumps that feed valves, by name; a single pump without a name is called `supply`."""
+        if not self.supplies or self.supply is None:
+            return {"supply": self.supply} if self.supply else {}
+        own = {name: group.model_dump(exclude={"axes", "priority"}, exclude_none=True)
+               for name, group in self.supplies.items()}  # fmt: skip
+        return {name: self.supply.model_copy(update=values) for name, values in own.items()}
+
+    @property
+    def supply_channels(self) -> tuple[str, ...]:
+        """Names of the channels of the pumps' pressures, in the order of `pumps`."""
+        return tuple(f"pressure_supply.{name}" for name in self.supplies) or ("pressure_supply",)
+
+    def pump_of(self, axis: str) -> str:
+        """Return the name in `pumps` of the pump that feeds the valve of an axis."""
+        return next((name for name, group in self.supplies.items() if axis in group.axes), "supply")
+
+    def supply_channel(self, axis: str) -> str:
+        """Return the name of the channel with the pressure of the pump that feeds an axis."""
+        return f"pressure_supply.{self.pump_of(axis)}" if self.supplies else "pressure_supply"
+
+    def axes_of_pump(self, pump: str) -> tuple[str, ...]:
+        """Return the valve axes that a pump of `pumps` feeds, in the order of `hydraulic_axes`."""
+        return tuple(name for name in self.valve_axes if self.pump_of(name) == pump)
 
     def max_feed_pressure(self, axis: str) -> float:
         """Return the maximum feed pressure of a hydraulic axis [Pa].
@@ -257,8 +352,7 @@ class Machine(StrictModel):
         pump = self.axes[axis].pump
         if pump:
             return pump.stall_pressure
-        assert self.supply
-        return self.supply.max_pressure
+        return self.pumps[self.pump_of(axis)].max_pressure
 
     def return_pressure(self, axis: str) -> float:
         """Return the pressure to which a hydraulic axis drains [Pa].
@@ -298,8 +392,7 @@ class Machine(StrictModel):
         if facts.force:
             most = abs(facts.force.gain) * facts.force.command_limit
         else:
-            assert self.supply
-            most = self.supply.relief_pressure * facts.hydraulic_drive.effective_areas[0]
+            most = self.pumps[self.pump_of(axis)].relief_pressure * facts.hydraulic_drive.effective_areas[0]
         turns = facts.cylinder is None and joint.type == "hinge"
         stiffness = most / (_END_STOP_ROTATION if turns else _END_STOP_TRAVEL)
         return EndStop(stiffness=stiffness, damping=_END_STOP_TIME_CONSTANT * stiffness)
@@ -318,7 +411,7 @@ class Machine(StrictModel):
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
         for side in ("head", "rod"):
             names += [f"pressure_{side}.{axis}" for axis in self.hydraulic_axes]
-        return (*names, "pressure_supply") if self.valve_axes else tuple(names)
+        return (*names, *self.supply_channels) if self.valve_axes else tuple(names)
 
     @model_validator(mode="after")
     def _check(self):
@@ -364,7 +457,7 @@ class Machine(StrictModel):
             if error.has_misalignment_or_backlash:
                 places = [f"angle.{joint}" for joint in self.undriven_sensed_joints]
                 _check_name_is_known(channel, places, "sensor_errors (tilt, backlash)")
-        _check_terms(self.terms, self.axes, self.supply)
+        _check_terms(self.terms, self.axes, self.pumps, self.pump_of)
         for name, sensors in self.sensors.items():
             for mounted, sensor in sensors.mounted.items():
                 _check_name_is_known(sensor.link, known, f"sensors.{name}.mounted.{mounted}.link")
@@ -378,7 +471,8 @@ class Machine(StrictModel):
         if self.valve_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
-            raise ValueError("at most 8 valves can share one supply")
+            raise ValueError("a machine can have at most 8 valves and axes with their own pump")
+        _check_pumps(self)
         return self
 
 
@@ -387,13 +481,41 @@ def _check_name_is_known(name: str, valid, where: str) -> None:
         raise ValueError(f"{where}: {name!r} is not known; {suggest_valid_name(name, valid)}")
 
 
-def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply | None) -> None:
-    seen, limited = set(), supply is not None and supply.kind != "constant_pressure"
+def _check_pumps(machine: Machine) -> None:
+    """Raise ValueError if the pumps, merging valves and engine of a machine do not fit its axes."""
+    fed = [name for group in machine.supplies.values() for name in group.axes]
+    for name, group in machine.supplies.items():
+        if name == "supply" or name in machine.axes:
+            raise ValueError(f"supplies.{name}: choose a name that is neither `supply` nor an axis")
+        for axis in group.axes:
+            _check_name_is_known(axis, machine.valve_axes, f"supplies.{name}.axes")
+    if fed and (len(set(fed)) < len(fed) or set(fed) != set(machine.valve_axes)):
+        message = "every axis with a valve must belong to exactly one pump"
+        raise ValueError(f"supplies: {message}: {', '.join(machine.valve_axes)}")
+    if fed:
+        for name, pump in machine.pumps.items():
+            try:
+                Supply.model_validate(pump.model_dump())
+            except ValueError as error:
+                raise ValueError(f"supplies.{name}: {error}") from None
+    for axis, valve in machine.merging.items():
+        _check_name_is_known(axis, machine.valve_axes, "merging")
+        for end in (valve.from_supply, valve.to_supply):
+            _check_name_is_known(end, machine.supplies, f"merging.{axis}")
+    unlimited = [name for name, pump in machine.pumps.items() if pump.kind == "constant_pressure"]
+    if unlimited and (machine.engine or machine.merging or any(g.priority for g in machine.supplies.values())):
+        message = "has no limited flow to merge, to limit by an engine or to divide by priority"
+        raise ValueError(f"{unlimited[0]}: a constant_pressure supply {message}")
+
+
+def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], pumps: dict[str, Supply], pump_of) -> None:
+    seen = set()
     for k, term in enumerate(terms):
         _check_name_is_known(term.axis, axes, f"terms.{k}.axis")
         if term.balance.startswith("flow") and not axes[term.axis].is_hydraulic:
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
-        if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
+        pump = pumps.get(pump_of(term.axis)) if axes[term.axis].valve else None
+        if term.balance == "flow_supply" and (pump is None or pump.kind == "constant_pressure"):
             raise ValueError(
                 f"terms.{k}: flow_supply adds to the flow of a shared pump: it needs an axis with a"
                 " valve and a supply of kind constant_flow or load_sensing"

@@ -276,7 +276,7 @@ def _full_scale(machine: Machine, channel: str) -> float | None:
     """
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure") and machine.supply:
-        return machine.supply.relief_pressure
+        return max(pump.relief_pressure for pump in machine.pumps.values())
     if kind == "length" and axis in machine.axes and machine.axes[axis].cylinder:
         return machine.axes[axis].cylinder.stroke  # type: ignore[union-attr]
     return None

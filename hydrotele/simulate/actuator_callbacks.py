@@ -32,6 +32,7 @@ from hydrotele.core.memory import address_to_pointer, float64_view
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, implicit_bristle_friction
 from hydrotele.hydraulics.actuator_layout import ACTUATOR_MARKER, CURVE_KNOTS, CURVE_SIZE
 from hydrotele.hydraulics.circuit import (
+    FEED,
     MAX_AXES,
     NO_EXTRA_STATES,
     SCRATCH_SIZE,
@@ -40,12 +41,10 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     actuator_friction,
     add_command_terms,
-    circuit_supply_pressure,
-    compute_inlet_conditions,
-    delivered_flow_fraction,
     implicit_friction,
     make_drive_state,
     pump_drive_force,
+    solve_state_supplies,
     step_circuit,
     write_term_state_rates,
 )
@@ -64,7 +63,8 @@ _PUMP_TIME_CONSTANT, _DELIVERY, _CURVES = (
     int(Slot.DELIVERY),
     int(Slot.CURVES),
 )
-_ADDED = int(Slot.ADDED_DELIVERY)
+_ADDED, _GROUP, _MERGE = int(Slot.ADDED_DELIVERY), int(Slot.GROUP_SIZE), int(Slot.MERGE_CURVE)
+_FROM, _TO = int(Slot.MERGE_FROM), int(Slot.MERGE_TO)
 _FORCE, _PUMPED = float(ActuatorKind.FORCE), float(ActuatorKind.PUMP_DRIVE)
 _GAIN_COUNT = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
@@ -179,8 +179,8 @@ def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
         act = scratch[SCRATCH_SIZE:]
         for k in range(size):
             act[k] = start[k] + dt * rate[k]
-        compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
-        supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
+        solve_state_supplies(user, 0, count, act, scratch)
+        supply = scratch[FEED + min(i, count - 1)]
     s = make_drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
     return s, Drives(count, act, lengths, velocities, commands)
 
@@ -207,7 +207,7 @@ def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, t
     """
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count
-    _, supply = step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
+    step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
     for i in range(first, first + count):
         u = i * SLOT_COUNT
         if user[u + _BRISTLE_STIFFNESS] > 0.0:
@@ -215,7 +215,7 @@ def _step_circuit_with_extra_states(user, first, drives, dt, act_dot, scratch, t
             act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _BRISTLE_INERTIA], dt)
     if len(terms) > 0 and first == 0:
         begun = Drives(count, act, length, velocity, arrived)
-        write_term_state_rates(user, terms, begun, act_dot, dt, time, supply)
+        write_term_state_rates(user, terms, begun, act_dot, dt, time, scratch[FEED:])
 
 
 @compile_without_allocation
@@ -233,12 +233,16 @@ def _has_valid_indices(user, first, count, nu, free):
     size = 4.0 * count + user[group + _EXTRA_STATES]
     if not (4.0 * count <= size <= free):
         return False
-    if user[group + _PUMP_TIME_CONSTANT] != 0.0 and not (4.0 * count <= user[group + _DELIVERY] < size):
-        return False
-    if user[group + _ADDED] != 0.0 and not (4.0 * count <= user[group + _ADDED] < size):
-        return False
     for u in range(group, (first + count) * SLOT_COUNT, SLOT_COUNT):
         if user[u + _BRISTLE_STIFFNESS] != 0.0 and not (4.0 * count <= user[u + _BRISTLE] < size):
+            return False
+        if user[u + _PUMP_TIME_CONSTANT] != 0.0 and not (4.0 * count <= user[u + _DELIVERY] < size):
+            return False
+        if user[u + _ADDED] != 0.0 and not (4.0 * count <= user[u + _ADDED] < size):
+            return False
+        if not (0.0 <= user[u + _FROM] < count and 0.0 <= user[u + _TO] < count):
+            return False
+        if not (0.0 <= user[u + _MERGE] <= CURVE_KNOTS and user[u + _GROUP] <= count):
             return False
         if not (0.0 <= user[u + _CURVES] <= CURVE_KNOTS):
             return False

@@ -29,11 +29,10 @@ from hydrotele.hydraulics.actuator_layout import (
 )
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS_PER_AXIS,
+    FEED,
     SCRATCH_SIZE,
-    circuit_supply_pressure,
-    compute_inlet_conditions,
-    delivered_flow_fraction,
     make_drive_state,
+    solve_state_supplies,
 )
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_released_air
 from hydrotele.machine.machine import Machine
@@ -350,7 +349,7 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
             `spool_rate`, `pressure_head`, `pressure_rod`. All but `order` and `angle` are optional
             and have their values at rest by default. `bristle` (axis -> fraction of the breakaway
-            force that the bristles carry), `delivery` and `added_delivery` (`supply` -> fraction
+            force that the bristles carry), `delivery` and `added_delivery` (pump -> fraction
             of the maximum flow that a pump with a time constant delivers, and that terms add) are 0
             by default. `joints` (name -> value) sets undriven joints; `drive` and `drive_velocity`
             (axis -> value) set the drive sides of transmissions.
@@ -429,13 +428,11 @@ def _evaluate_term_rows(user, terms, count, gain, time, act, x, v, command, out)
     """
     scratch = np.zeros(SCRATCH_SIZE)
     for row in range(len(time)):
-        supply = 0.0
         if count > 0:
-            compute_inlet_conditions(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
-            share = delivered_flow_fraction(user, 0, act[row])
-            supply = circuit_supply_pressure(user, 0, count, scratch, share)
+            solve_state_supplies(user, 0, count, act[row], scratch)
         drives = Drives(count, act[row], x[row], v[row], command[row])
         for i in range(len(gain)):
+            supply = scratch[FEED + min(i, count - 1)] if count > 0 else 0.0
             s = make_drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
                 gain[i],

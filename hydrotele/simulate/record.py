@@ -130,15 +130,15 @@ def _count_single_dof_joints(kinds):
 def sensed_channels(plant: Plant) -> tuple[str, ...]:
     """Return the names of the log channels of the sensor values, in the order of compiled code.
 
-    These are the positions of all axes, head and rod pressure of every hydraulic axis, the supply
-    pressure if there are hydraulic axes, and the lengths of all cylinders.
+    These are the positions of all axes, head and rod pressure of every hydraulic axis, the pressure
+    of every supply if there are hydraulic axes, and the lengths of all cylinders.
     """
     machine = plant.machine
     names = [f"{machine.position_kind(axis)}.{axis}" for axis in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
         names += [f"pressure_head.{axis}", f"pressure_rod.{axis}"]
     if plant.hydraulic:
-        names.append("pressure_supply")
+        names += machine.supply_channels
     return (*names, *(f"length.{axis}" for axis in plant.axes if machine.axes[axis].cylinder))
 
 

@@ -187,7 +187,7 @@ class Readings(NamedTuple):
         rate: (k,) difference quotients of the last two positions [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        supply: (1,) supply pressure [Pa].
+        supply: (s,) pressures of the supplies, in the order of `Machine.pumps` [Pa].
     """
 
     joint: np.ndarray
@@ -222,13 +222,15 @@ def store_readings(values, hydraulic_count, sample_time, readings):
 
     Args:
         values: (c,) new readings: k joint positions, head and rod pressure of every hydraulic axis,
-            supply pressure [rad] or [m], [Pa].
+            pressure of every supply [rad] or [m], [Pa].
         hydraulic_count: number of hydraulic axes, scalar.
         sample_time: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
-        readings: Readings, written except for the supply pressure.
+        readings: Readings, written.
 
     Returns:
-        Supply pressure, scalar [Pa]; 0 without hydraulic axes.
+        Nothing.
+
+    Source: models/cat215/README.md, "Sensors".
     """
     k = len(readings.joint)
     for i in range(k):
@@ -236,7 +238,9 @@ def store_readings(values, hydraulic_count, sample_time, readings):
         readings.joint[i] = values[i]
     for i in range(hydraulic_count):
         readings.head[i], readings.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
-    return values[k + 2 * hydraulic_count] if hydraulic_count > 0 else 0.0
+    if hydraulic_count > 0:
+        for i in range(len(readings.supply)):
+            readings.supply[i] = values[k + 2 * hydraulic_count + i]
 
 
 class FeedbackTable(NamedTuple):
@@ -279,7 +283,7 @@ def sample_sensors_if_due(table, sim, tick, steps):
     apply_sensor_delays(sim.sensor_history, tick * steps, values)
     convert_to_readings(table.sensors, values, table.errors[tick // table.ticks_per_sample])
     span = table.period if tick > 0 else 0.0
-    table.readings.supply[0] = store_readings(values, sim.hydraulic, span, table.readings)
+    store_readings(values, sim.hydraulic, span, table.readings)
 
 
 class Feedback:
@@ -294,18 +298,14 @@ class Feedback:
         rate: (k,) difference quotients of the last two positions [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
+        supply: (s,) pressures of the supplies [Pa]; 0 without hydraulic axes.
     """
 
     def __init__(self, table: FeedbackTable, errors: Mapping[str, np.ndarray]) -> None:
         """Create the feedback, before its first sample."""
         self.table, self.errors = table, errors
         self.ticks_per_sample, self.period = table.ticks_per_sample, table.period
-        self.joint, self.rate, self.head, self.rod, self._supply = table.readings
-
-    @property
-    def supply(self) -> float:
-        """Supply pressure [Pa]; 0 without hydraulic axes."""
-        return float(self._supply[0])
+        self.joint, self.rate, self.head, self.rod, self.supply = table.readings
 
     def update(self, tick: int, stepper: Stepper) -> None:
         """Sample all sensors every `ticks_per_sample` control ticks; at other ticks keep the last readings.
@@ -335,7 +335,8 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
         InputError: the control rate is not a multiple of the sensors' rate.
     """
     every, k = periods_per_sample(control_rate, sensors), len(plant.axes)
-    names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (1 if plant.hydraulic else 0)]
+    supplies = len(plant.machine.supply_channels)
+    names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (supplies if plant.hydraulic else 0)]
     kinds = {name: find_channel_sensor(plant.machine, sensors, name) for name in names}
     count = ticks // every + 1  # including the unused sample after the last tick
     errors = {name: sample_sensor_errors(kinds[name], seed, name, count) for name in names}
@@ -350,7 +351,7 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
             *np.array([make_channel_converter(kinds[name], name) for name in names]).T.copy(),
         ),
         np.column_stack(list(errors.values())) + np.column_stack(changes),
-        Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(1)),
+        Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(supplies)),
     )  # fmt: skip
     return Feedback(table, errors)
 

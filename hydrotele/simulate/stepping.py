@@ -15,13 +15,12 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
-from hydrotele.hydraulics.circuit import SCRATCH_SIZE, SLOT_COUNT
+from hydrotele.hydraulics.circuit import FEED, SCRATCH_SIZE, SLOT_COUNT, group_size, solve_state_supplies
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.sensors import SensorError, step_first_order_lag
 from hydrotele.simulate.mujoco_c_api import call_mj_step, function_address
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels, split_delay
-from hydrotele.simulate.true_values import state_supply_pressure
 
 
 class CommandDelayLine(NamedTuple):
@@ -164,12 +163,12 @@ def true_sensor_values(sim, out):
     Args:
         sim: Simulation.
         out: (c,) written: k joint positions [rad], [m], head and rod pressure of every hydraulic
-            axis, supply pressure where there is one [Pa], l cylinder lengths [m].
+            axis, pressure of every supply [Pa], l cylinder lengths [m].
 
     Returns:
         Nothing.
 
-    Source: `simulate.record.align_staggered_positions` and `state_supply_pressure`.
+    Source: `simulate.record.align_staggered_positions` and `solve_state_supplies`.
     """
     k, h = sim.axes, sim.hydraulic
     for i in range(k):
@@ -178,8 +177,12 @@ def true_sensor_values(sim, out):
         out[k + 2 * i], out[k + 2 * i + 1] = sim.act[4 * i + 2], sim.act[4 * i + 3]
     at = k + 2 * h
     if h > 0:
-        out[at] = state_supply_pressure(sim.user, h, sim.act, np.empty(SCRATCH_SIZE))
-        at += 1
+        scratch, i = np.empty(SCRATCH_SIZE), 0
+        solve_state_supplies(sim.user, 0, h, sim.act, scratch)
+        while i < h:
+            out[at] = scratch[FEED + i]
+            i += group_size(sim.user, 0, h, i)
+            at += 1
     for i in range(len(sim.rod_qpos)):
         out[at + i] = sim.qpos[sim.rod_qpos[i]] - sim.timestep * sim.qvel[sim.rod_dof[i]]
 

@@ -9,13 +9,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.hydraulics.circuit import (
     ACTIVATIONS_PER_AXIS,
+    FEED,
     SCRATCH_SIZE,
     SLOT_COUNT,
     Slot,
     axis_flows_and_force,
-    circuit_supply_pressure,
-    compute_inlet_conditions,
-    delivered_flow_fraction,
+    solve_state_supplies,
 )
 from hydrotele.simulate.closed_loops import dependent_joints
 from hydrotele.simulate.plant import Plant, evaluate_terms
@@ -27,27 +26,8 @@ _SPOOL_CHANNELS = ("spool", "1"), ("spool_rate", "1/s")
 
 
 @compiled
-def state_supply_pressure(user, count, act, scratch):
-    """Compute the supply pressure of the hydraulic circuit from the activations of a state.
-
-    Args:
-        user: (nu * SLOT_COUNT,) actuator parameters.
-        count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) activations, and the state of a pump with a time constant.
-        scratch: (SCRATCH_SIZE,) work space.
-
-    Returns:
-        p_s, scalar [Pa].
-
-    Source: models/cat215/README.md, "Supply".
-    """
-    compute_inlet_conditions(user, act, act, scratch, 0, count, 0.0, act)
-    return circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
-
-
-@compiled
 def compute_state_flows_and_forces(user, count, act, x, v):
-    """Compute supply pressure, valve flows and drive forces of n states.
+    """Compute supply pressures, valve flows and drive forces of n states.
 
     Args:
         user: (nu * SLOT_COUNT,) actuator parameters.
@@ -57,24 +37,24 @@ def compute_state_flows_and_forces(user, count, act, x, v):
         v: (n, nu) drive velocities [m/s] or [rad/s].
 
     Returns:
-        (n, 1 + 3 count): supply pressure [Pa]; then for every axis the valve flows into head and rod
+        (n, 4 count), for every axis: pressure that feeds it [Pa], valve flows into head and rod
         chamber [m^3/s] and the force after friction [N] or [N m], without terms.
 
     Source: models/cat215/README.md.
     """
     scratch = np.zeros(SCRATCH_SIZE)
-    out = np.zeros((act.shape[0], 1 + 3 * count))
+    out = np.zeros((act.shape[0], 4 * count))
     for row in range(act.shape[0]):
-        supply = state_supply_pressure(user, count, act[row], scratch)
-        out[row, 0] = supply
+        solve_state_supplies(user, 0, count, act[row], scratch)
         for i in range(count):
             share = 0.0
             if user[i * SLOT_COUNT + _STIFFNESS] > 0.0:
                 share = act[row, int(user[i * SLOT_COUNT + _BRISTLE])]
             q_head, q_rod, force = axis_flows_and_force(
-                user, i, supply, act[row, 4 * i : 4 * i + 4], x[row, i], v[row, i], share
+                user, i, scratch[FEED + i], act[row, 4 * i : 4 * i + 4], x[row, i], v[row, i], share
             )
-            out[row, 1 + 3 * i], out[row, 2 + 3 * i], out[row, 3 + 3 * i] = q_head, q_rod, force
+            out[row, 4 * i], out[row, 4 * i + 1] = scratch[FEED + i], q_head
+            out[row, 4 * i + 2], out[row, 4 * i + 3] = q_rod, force
     return out
 
 
@@ -224,26 +204,29 @@ def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
     user = plant.model.actuator_user.ravel()
     table = compute_state_flows_and_forces(user, count, np.ascontiguousarray(record.act), x, v)
     if plant.machine.valve_axes:
-        put("pressure_supply", table[:, 0], "Pa")
+        for channel, pump in zip(plant.machine.supply_channels, plant.machine.pumps, strict=True):
+            first = plant.axes.index(plant.machine.axes_of_pump(pump)[0])
+            put(channel, table[:, 4 * first], "Pa")
     more = evaluate_terms(plant.machine, record.time, record.act, x, v, record.command)
-    total = np.zeros(len(record.time))
+    flows = {pump: np.zeros(len(record.time)) for pump in plant.machine.pumps}
     for i, name in enumerate(plant.axes[:count]):
         cylinder, pumped = plant.machine.axes[name].cylinder, plant.machine.axes[name].pump
         kinds = (("speed", "rad/s"), ("pressure_load", "Pa")) if pumped else _SPOOL_CHANNELS
         for place, (kind, unit) in enumerate(kinds):
             put(f"truth.{kind}.{name}", record.act[:, ACTIVATIONS_PER_AXIS * i + place], unit)
-        put(f"truth.flow_head.{name}", table[:, 1 + 3 * i], "m^3/s")
-        put(f"truth.flow_rod.{name}", table[:, 2 + 3 * i], "m^3/s")
-        force = table[:, 3 + 3 * i] + more[:, i, 0]
+        put(f"truth.flow_head.{name}", table[:, 4 * i + 1], "m^3/s")
+        put(f"truth.flow_rod.{name}", table[:, 4 * i + 2], "m^3/s")
+        force = table[:, 4 * i + 3] + more[:, i, 0]
         put(f"truth.force.{name}", force, "N" if cylinder else "N m")
         if cylinder:
             put(f"truth.piston_velocity.{name}", v[:, i], "m/s")
         if pumped:  # has its own pump
             continue
         fed_head = record.act[:, ACTIVATIONS_PER_AXIS * i] > 0.0
-        total += np.where(fed_head, table[:, 1 + 3 * i], table[:, 2 + 3 * i])
+        flows[plant.machine.pump_of(name)] += np.where(fed_head, table[:, 4 * i + 1], table[:, 4 * i + 2])
     if plant.machine.valve_axes:
-        put("truth.flow_supply", total, "m^3/s")
+        for pump, flow in flows.items():
+            put("truth.flow_supply" if pump == "supply" else f"truth.flow_supply.{pump}", flow, "m^3/s")
 
 
 def extract_drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -77,7 +77,7 @@ def one_step(axis, servo=None, error=0.0, velocity=0.0, arm=1.0, rate=0.0, load=
     servo_step(
         numbers, np.arange(4) == k,
         DriveReference(full(velocity), full(arm), full(0.02), full(0.02)), reference,
-        MeasuredState(full(0.0), full(rate), head, rod, SUPPLY),
+        MeasuredState(full(0.0), full(rate), head, rod, np.array([SUPPLY])),
         forces if load is None else load * forces, ComputedForce(False, full(0.0), full(0.0)), out,
     )  # fmt: skip
     assert np.all(np.delete(out, k) == 0.123)  # what is not under feedback keeps its command

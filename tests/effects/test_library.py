@@ -49,6 +49,7 @@ PUMPED = {
     "motor_viscous_drag": {"piston"}, "line_compliance": {"piston.head", "piston.rod"},
     "accumulator_pressure": {"piston"}, "load_relief": {"piston"}, "load_friction": {"piston"},
 }  # fmt: skip
+MERGED = {"merging_valve": {"boom", "stick", "tilt"}}  # of the CAT 325, which has two pumps
 SENSED = {"joint_bending", "sensor_misalignment", "sensor_backlash"}  # of a calibrator's joints
 machine_of = functools.cache(load_machine)
 untouched = functools.cache(lambda name, tool: load_machine(name, tool))  # no test gets hold of it
@@ -89,8 +90,9 @@ def test_names_and_places_are_those_agreed():
     found = {name: set(effect.locations(machine)) for name, effect in EFFECTS.items()}
     assert {name: places for name, places in found.items() if places} == PLACES
     pumped = machine_of("eha", "load_30_bar")
-    others = set(found) - set(PLACES) - SENSED
+    others = set(found) - set(PLACES) - SENSED - set(MERGED)
     assert {n: set(EFFECTS[n].locations(pumped)) for n in others} == PUMPED
+    assert {n: set(EFFECTS[n].locations(machine_of("cat325", None))) for n in MERGED} == MERGED
     calibrator = machine_of("calibrator", None)
     own = set(calibrator.undriven_sensed_joints)  # the others are the arm's
     assert own and all(set(EFFECTS[name].locations(calibrator)) == own for name in SENSED)
@@ -220,7 +222,7 @@ def test_is_felt(machine, tool, name, place):
     if name == "pump_droop":  # felt only where the pump's flow is short
         given["droop"] = 0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)["droop"].upper_bound
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
-        given["pump_flow"] = 0.3 * machine_of(machine, tool).supply.pump_flow
+        given["pump_flow"] = 0.3 * machine_of(machine, tool).pumps[place.removeprefix("supply.")].pump_flow
     if name == "force_pulse":  # the usual one comes after the end of this run
         given["start"] = 0.05
     planted = {"name": name, "location": place, "parameters": given}

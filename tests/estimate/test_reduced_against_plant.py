@@ -1,6 +1,7 @@
 """Free runs of the reduced model against the MuJoCo plant, with every part that drives can have."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, 
 from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, Slot
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.machine.drives import EndStop
-from hydrotele.machine.machine_file import save_machine
+from hydrotele.machine.machine import Engine
+from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.term import Term
@@ -167,6 +169,17 @@ def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
     if CASES[case]:
         nominal = differences(reduced_of, machine_of(name), plan, 40)
         assert beyond(nominal), "without the effect it would be seen"
+
+
+def test_two_pumps_with_merging_priority_and_engine(reduced_of, tmp_path):
+    """At full commands, so that pumps and engine limit the flows."""
+    two = load_machine(Path(__file__).parents[1] / "data" / "two_pumps")
+    machine = two.model_copy(update={"engine": Engine(power=60e3)})
+    save_machine(machine, tmp_path / "machine.yaml")
+    plan = scenario("cat215/none", machine.axes, (), 1.25e-4, 1.0).model_copy(update={"machine": str(tmp_path)})
+    assert not beyond(differences(reduced_of, machine, plan, 80))
+    for without in ({"merging": {}}, {"engine": None}):
+        assert beyond(differences(reduced_of, machine.model_copy(update=without), plan, 80))
 
 
 def run_into(phase):

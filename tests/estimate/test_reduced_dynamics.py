@@ -179,7 +179,7 @@ def test_late_scaled_and_shifted_channels(machine_of, reduced_of):
             # rounding of a straight line between two steps
             assert out[c] == pytest.approx(error.scale * value + error.offset, rel=1e-12)
         advance(model, space, z, command, row, PERIOD, steps, trail[row * steps :])
-    assert supply_of(ideal, room, z) > 0
+    assert supply_of(ideal, room, z, 0) > 0
 
 
 def test_keeping_a_trail_changes_nothing(machine_of, reduced_of):

@@ -141,7 +141,7 @@ def test_one_axis_alone_agrees_with_the_independent_integration(user):
 
 def flows(user, state, x, v):
     """Supply flows and, per chamber of every axis, all oil that enters, [m^3/s]."""
-    ports, fed, net = np.zeros(12), 0.0, []
+    ports, fed, net = circuit_scratch(), 0.0, []
     compute_inlet_conditions(user, state, state, ports, 0, 3, 0.0, state)
     p_s = solve_supply_pressure(ports, 3, SMOOTHING, RELIEF, PUMP)
     for i in range(3):

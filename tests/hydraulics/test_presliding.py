@@ -19,9 +19,10 @@ from hydrotele.hydraulics.circuit import (
     Slot,
     circuit_supply_pressure,
     compute_inlet_conditions,
-    demanded_flow_fraction,
     step_circuit,
+    write_demanded_fractions,
 )
+from hydrotele.hydraulics.supply import DEMAND
 from hydrotele.machine.drives import Axis, Friction
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
@@ -145,23 +146,26 @@ def test_without_the_numbers_nothing_is_remembered():
         machine = load_machine(name)
         assert extra_state_names(machine) == []
         for numbers in actuator_parameters(machine).values():
-            assert not numbers[Slot.BRISTLE_STIFFNESS : Slot.CURVES].any()
+            assert not numbers[Slot.BRISTLE_STIFFNESS : Slot.GROUP_SIZE].any()
 
 
 def test_what_is_remembered_stands_behind_the_activations():
-    machine = apply_effect(load_machine("cat325"), "pump_lag", "", {"time_constant": 0.2})
+    machine = load_machine("cat325")
+    for pump in ("front", "rear"):
+        machine = apply_effect(machine, "pump_lag", f"supply.{pump}", {"time_constant": 0.2})
     order = [n for n, a in machine.axes.items() if not a.pump]
     for name in order:
         usual = EFFECTS["presliding"].parameters(machine, name)["compliance"].prior_std
         machine = apply_effect(machine, "presliding", name, {"compliance": usual})
     names, valves = extra_state_names(machine), list(machine.hydraulic_axes)
     drives = [n for n, a in machine.axes.items() if a.force]
-    assert names == [*(f"bristle.{n}" for n in valves), "delivery.supply",
+    assert names == [*(f"bristle.{n}" for n in valves), "delivery.front", "delivery.rear",
                      *(f"bristle.{n}" for n in drives)]  # fmt: skip
     numbers = actuator_parameters(machine)
     assert numbers[valves[0]][Slot.BRISTLE] == 4 * len(valves)
-    assert all(numbers[n][Slot.EXTRA_STATES] == len(valves) + 1 for n in valves)
-    assert all(numbers[n][Slot.DELIVERY] == 5 * len(valves) for n in valves)
+    assert all(numbers[n][Slot.EXTRA_STATES] == len(valves) + 2 for n in valves)
+    places = {"front": 5 * len(valves), "rear": 5 * len(valves) + 1}
+    assert all(numbers[n][Slot.DELIVERY] == places[machine.pump_of(n)] for n in valves)
 
 
 def test_what_cannot_be_is_refused():
@@ -191,12 +195,13 @@ def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     now, scratch, rates = slow_pump(0.0), np.zeros(SCRATCH_SIZE), np.zeros(5)
     act = np.array([0.6, 0.0, 2e6, 2e6, 0.0])
     compute_inlet_conditions(user, act, act, scratch, 0, 1, 0.0, act)
-    wanted = demanded_flow_fraction(user, 0, 1, scratch)
-    without = circuit_supply_pressure(now, 0, 1, scratch, 1.0)
+    write_demanded_fractions(user, 0, 1, scratch)
+    wanted, flow = scratch[DEMAND], user[Slot.PUMP_FLOW]
+    without = circuit_supply_pressure(now, 0, 1, scratch, flow, 0.0)
     assert 0.2 < wanted < 1.0
-    low = circuit_supply_pressure(user, 0, 1, scratch, 0.5 * wanted)
+    low = circuit_supply_pressure(user, 0, 1, scratch, 0.5 * wanted * flow, 0.0)
     assert low < without, "a pump that is not there yet falls short"
-    assert circuit_supply_pressure(user, 0, 1, scratch, wanted) == pytest.approx(without, rel=1e-9)
+    assert circuit_supply_pressure(user, 0, 1, scratch, wanted * flow, 0.0) == pytest.approx(without, rel=1e-9)
     shares = []
     for _ in range(400):
         act[:4] = 0.6, 0.0, 2e6, 2e6

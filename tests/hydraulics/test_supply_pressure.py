@@ -9,6 +9,7 @@ from hydrotele.hydraulics.circuit import (
     SLOT_COUNT,
     Slot,
     axis_flows_and_force,
+    circuit_scratch,
     compute_inlet_conditions,
     solve_supply_pressure,
 )
@@ -94,7 +95,7 @@ def user_of(*gains):
 
 @pytest.mark.parametrize("opening", [(1.0, 1.0), (1.0, -1.0), (-0.8, -0.8)])
 def test_two_open_valves_share_the_pump_flow(opening):
-    user, ports = user_of(2.3e-6, 2.3e-6), np.zeros(8)
+    user, ports = user_of(2.3e-6, 2.3e-6), circuit_scratch()
     act = np.array([opening[0], 0, 8e6, 3e6, opening[1], 0, 6e6, 4e6])
     compute_inlet_conditions(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
     pressure = solve_supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
@@ -112,7 +113,7 @@ def test_two_open_valves_share_the_pump_flow(opening):
 
 
 def test_load_check_keeps_a_heavy_load_from_feeding_a_light_one():
-    user, ports = user_of(2.3e-6, 6e-6), np.zeros(8)
+    user, ports = user_of(2.3e-6, 6e-6), circuit_scratch()
     act = np.array([1.0, 0, 25e6, 3e6, 1.0, 0, 1e6, 2e6])
     compute_inlet_conditions(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
     pressure = solve_supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)

@@ -12,12 +12,11 @@ from hydrotele.hydraulics.circuit import (
     NO_EXTRA_STATES,
     SLOT_COUNT,
     circuit_scratch,
-    circuit_supply_pressure,
-    compute_inlet_conditions,
-    compute_supply_pressure_derivatives,
+    solve_state_supplies,
     step_circuit,
 )
 from hydrotele.hydraulics.laws import counterbalance_opening, end_stop_force, spool_step, valve_opening
+from hydrotele.hydraulics.supply import compute_supply_pressure_derivatives
 from hydrotele.hydraulics.valve import axis_valve_opening, chamber_flows
 from hydrotele.machine.machine import Supply
 from hydrotele.machine.machine_file import load_machine
@@ -251,8 +250,7 @@ def supply_of(act, **supply):
     user = np.concatenate(list(actuator_parameters(changed_machine(supply=supply)).values()))
     ports = circuit_scratch()
     act = np.array(act, float)
-    compute_inlet_conditions(user, act, act, ports, 0, 3, 0.0, act)
-    return circuit_supply_pressure(user, 0, 3, ports, 1.0), user, ports
+    return solve_state_supplies(user, 0, 3, act, ports), user, ports
 
 
 CALM = [0.0, 0, 9e6, 9e6, 0.1, 0, 8e6, 5e6, -0.08, 0, 6e6, 7e6]
@@ -302,7 +300,7 @@ def test_the_supply_follows_the_chambers_with_an_override_as_its_coupling_says(a
     given = {"relief_override": 8e8}
     pressure, user, ports = supply_of(act, **given)
     slopes = np.zeros(len(ports))
-    assert compute_supply_pressure_derivatives(user, 0, 3, ports, pressure, slopes)
+    assert compute_supply_pressure_derivatives(user, 0, 3, ports, pressure, 0.0, slopes)
     for i in range(3):
         side = 2 if act[4 * i] > 0.0 else 3
         moved = [list(act), list(act)]

@@ -37,7 +37,7 @@ def test_imports_nothing_of_ours():
 def test_every_kind_survives_naming_and_parsing(kind_and_truth, axis):
     kind, truth = kind_and_truth
     axes = (log_channels.TRUTH_KINDS if truth else log_channels.MEASURED_KINDS)[kind].axes
-    axis = {"free": axis, "xyz": "z", "none": ""}[axes]
+    axis = {"free": axis, "optional": axis, "xyz": "z", "none": ""}[axes]
     name = log_channels.channel_name(kind, axis, truth=truth)
     assert log_channels.parse_channel(name) == (kind, axis, truth)
     assert log_channels.parse_channel(name).name == name
@@ -58,7 +58,7 @@ def test_every_kind_survives_naming_and_parsing(kind_and_truth, axis):
         ("angle.Boom", "lower case"),
         ("angle.boom.x", "lower case"),
         ("time.boom", "write time"),
-        ("pressure_supply.boom", "write pressure_supply"),
+        ("valid.boom", "write valid"),
         ("truth.tip.w", "x, y and z"),
         ("truth.command.boom", "truth.flow_head.<axis>"),
         ("acceleration.boom", "truth.acceleration.<axis>"),

@@ -130,14 +130,14 @@ def compute_servo_commands(servo_parameters, grid, table, reference, rate_ahead,
     """Compute the valve or drive commands of the joint servo for n episodes.
 
     Args:
-        servo_parameters: (k, 14) gains and drive parameters from `control.servo.servo_parameters`.
+        servo_parameters: (k, 15) gains and drive parameters from `control.servo.servo_parameters`.
         grid: (k, 2) lowest joint position and step of `table`.
         table: (k, TABLE_POINTS, 3) moment arms and chamber volumes from
             `control.servo.tabulate_drive_geometry`.
         reference: (n, k) reference positions now [rad] or [m].
         rate_ahead: (n, k) reference rates [rad/s] or [m/s] at a time ahead of now by the lag of the
             valve spool.
-        measured: MeasuredState with (n, k) arrays, (n,) supply pressures.
+        measured: MeasuredState with (n, k) arrays, (n, s) supply pressures.
         load: (n, k) low-pass filtered drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
 
@@ -235,12 +235,13 @@ class ValveServo:
         self._grid, self._table = tabulate_drive_geometry(machine, setup.axes)
         valves = [i for i, name in enumerate(setup.axes) if machine.axes[name].is_hydraulic]
         names = [setup.axes[i] for i in valves]
+        pumps = machine.supplies or [""]
         self._valves = np.array(valves, int)
         self._joint = find_position_columns(setup)
         self._rate = find_observation_columns(setup, "rate", setup.axes)
         self._head = find_observation_columns(setup, "pressure_head", names)
         self._rod = find_observation_columns(setup, "pressure_rod", names)
-        self._supply = find_observation_columns(setup, "pressure_supply", [""] if names else [])
+        self._supply = find_observation_columns(setup, "pressure_supply", list(pumps) if names else [])
 
     def begin(self, count: int) -> None:
         """Allocate the controller state for `count` parallel episodes."""
@@ -267,7 +268,7 @@ class ValveServo:
         seen, joint = observation.astype(float), observation[:, self._joint].astype(float)
         head, rod = np.zeros_like(joint), np.zeros_like(joint)
         head[:, self._valves], rod[:, self._valves] = seen[:, self._head], seen[:, self._rod]
-        supply = seen[:, self._supply[0]] if len(self._supply) else np.zeros(len(seen))
+        supply = seen[:, self._supply]
         force = self._parameters[:, 1] * head - self._parameters[:, 2] * rod
         self._load[self._is_new], self._integral[self._is_new] = force[self._is_new], 0.0
         self._commands[self._is_new], self._is_new[:] = 0.0, False

@@ -7,10 +7,9 @@ change the actuators' numbers, activations or applied forces, and no code of the
 
 import math
 
-from hydrotele.hydraulics.circuit import Slot, circuit_scratch
+from hydrotele.hydraulics.circuit import Slot, circuit_scratch, solve_state_supplies
 from hydrotele.hydraulics.laws import orifice_flow
 from hydrotele.hydraulics.valve import axis_valve_opening
-from hydrotele.simulate.true_values import state_supply_pressure
 
 _WARM_UP = 40.0  # s
 _REGULATOR = 0.05  # s, of a pump's torque control
@@ -93,7 +92,7 @@ def power_limit(model, i, machine, location, p):
     part = model.opt.timestep / _REGULATOR
 
     def step(data):
-        supply = state_supply_pressure(flat, count, data.act, scratch)
+        supply = solve_state_supplies(flat, 0, count, data.act, scratch)
         wanted = min(base, p["power"] / max(supply, 1e6))
         user[:, Slot.PUMP_FLOW] += part * (wanted - user[0, Slot.PUMP_FLOW])
 

@@ -9,14 +9,13 @@ import numpy as np
 from scipy.signal import lsim, lti
 
 from hydrotele.hydraulics.actuator_layout import actuator_order
-from hydrotele.hydraulics.circuit import circuit_scratch
+from hydrotele.hydraulics.circuit import circuit_scratch, solve_state_supplies
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.sensors import SensorError
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
 from hydrotele.simulate.sensor_models import simulate_readings
-from hydrotele.simulate.true_values import state_supply_pressure
 from tools.validation.blind.draw import Planted
 from tools.validation.blind.outside import OUTSIDE
 
@@ -114,7 +113,7 @@ def _supply(machine: Machine, truth: Log, numbers: dict[int, np.ndarray]) -> np.
     kinds = ("truth.spool", "truth.spool_rate", "pressure_head", "pressure_rod")
     act = np.column_stack([truth[f"{kind}.{axis}"] for axis in order for kind in kinds])
     return np.array([
-        state_supply_pressure(numbers[row], len(order), np.ascontiguousarray(act[row]), scratch)
+        solve_state_supplies(numbers[row], 0, len(order), np.ascontiguousarray(act[row]), scratch)
         for row in range(len(act))
     ])  # fmt: skip
 
