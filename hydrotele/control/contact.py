@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr, logsumexp
+from scipy.special import log_ndtr
 
-from hydrotele.control.log_forces import BLOCK_SECONDS, ExternalForces, compute_external_forces
+from hydrotele.control.log_forces import BLOCK_SECONDS, FILTER_SECONDS, ExternalForces, compute_external_forces
 from hydrotele.effects import EFFECTS
 from hydrotele.effects.effect import max_drive_force
 from hydrotele.hydraulics.actuator_layout import actuator_order
@@ -36,17 +36,17 @@ from hydrotele.logs.dataset import (
     merge_runs,
     remove_truth,
 )
-from hydrotele.logs.masked_intervals import MaskedInterval
+from hydrotele.logs.masked_intervals import MaskedInterval, find_unmasked_rows
 from hydrotele.logs.resampling import average_rows
 from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine import Machine
 
+_FREE, _LOAD_CHANGES, _CONTACT = range(3)  # states of the tool
 _TASKS = ("r", "theta", "z", "attitude", "head")
 _MEAN_INTERVAL_S = 3.0  # [s] prior mean duration of contact, and of the time between contacts
 _LOAD_CHANGE_S = 1.0  # [s] time in which a load in contact may change by its prior standard deviation
 _SIZE_RATIO = 2.0  # ratio of the tip forces of neighbouring states of contact
-_MAX_ITERATIONS = 40
-_TOLERANCE = 1e-3  # largest change of a probability at convergence
+_SIGNIFICANT_STD = 3.0  # standard deviations by which a load exceeds the smallest one of the run
 _MIN_SINGULAR_RATIO = 1e-3  # smaller singular values of the parameter effects over the noise are omitted
 
 
@@ -58,6 +58,7 @@ class Contact:
         run: name of the run in the data.
         time: (b,) mean time of each block [s].
         probability: (b,) probability of contact [1].
+        load_change: (b,) probability that the load changes without contact, as when a bucket is emptied [1].
         task: names of the m task coordinates of the force.
         force: (b, m) force of the environment on the tip [N] or [N m].
         force_std: (b, m) its standard deviation, with the uncertainty of machine and load.
@@ -68,6 +69,7 @@ class Contact:
     run: str
     time: np.ndarray
     probability: np.ndarray
+    load_change: np.ndarray
     task: tuple[str, ...]
     force: np.ndarray
     force_std: np.ndarray
@@ -75,12 +77,22 @@ class Contact:
     load_std: np.ndarray
 
     @property
-    def intervals(self) -> list[tuple[float, float]]:
-        """Start and end [s] of the intervals in which contact is more probable than no contact."""
-        touching = self.probability > 0.5
-        edges = np.flatnonzero(np.diff(touching, prepend=False, append=False))
-        half = 0.5 * BLOCK_SECONDS
-        return [(self.time[a] - half, self.time[b - 1] + half)
+    def is_contact(self) -> np.ndarray:
+        """Whether contact is more probable than no contact (b,)."""
+        return self.probability > 0.5
+
+    @property
+    def is_loaded(self) -> np.ndarray:
+        """Whether the tool is free, and its load changes or is significantly larger than the smallest load (b,)."""
+        least = int(np.argmin(self.load))
+        more = self.load - self.load[least] > _SIGNIFICANT_STD * np.hypot(self.load_std, self.load_std[least])
+        return ~self.is_contact & (more | (self.load_change > 0.5))
+
+    def find_intervals(self, marked: np.ndarray) -> list[tuple[float, float]]:
+        """Return start and end [s] of the intervals of marked blocks (b,), with the windows of their filter."""
+        edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
+        half = 0.5 * FILTER_SECONDS
+        return [(float(self.time[a]) - half, float(self.time[b - 1]) + half)
                 for a, b in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
 
 
@@ -111,12 +123,17 @@ def detect_contact(
 
 
 def contact_masks(found: Sequence[Contact], files: Sequence[RunFiles]) -> tuple[MaskedInterval, ...]:
-    """Return the masked intervals of detected contact, with times as in the log files."""
+    """Return the masked intervals of contact and of loads, with times as in the log files."""
     start = {run.name: run.logs[0].origin for run in files}
     return tuple(
         MaskedInterval(one.run, begin + start[one.run], end + start[one.run])
-        for one in found for begin, end in one.intervals
+        for one in found for begin, end in one.find_intervals(one.is_contact | one.is_loaded)
     )  # fmt: skip
+
+
+def find_contact_rows(found: Contact, time: np.ndarray) -> np.ndarray:
+    """Return for each time (n,) [s] of a run whether the tool is in contact."""
+    return ~find_unmasked_rows([MaskedInterval("", *pair) for pair in found.find_intervals(found.is_contact)], "", time)
 
 
 def _prepare_runs(files, machine, sensors, masks) -> tuple[Dataset, dict[str, str]]:
@@ -139,40 +156,15 @@ def _prepare_runs(files, machine, sensors, masks) -> tuple[Dataset, dict[str, st
 def _detect_in_run(forces: ExternalForces, machine: Machine, run: str) -> Contact:
     """Compute the probability of contact, the tip force and the load in every block of a run."""
     load_std = next(iter(EFFECTS["payload"].parameters(machine, "tool").values())).prior_std
-    observed, places = _observation_matrix(forces, load_std)
+    observed, load = _observation_matrix(forces, load_std)
     unit = _unit_force_covariance(forces, machine)
     sizes = _force_sizes(forces, unit, machine)
-    b, n = forces.force.shape
-    k, size = observed.shape[2], forces.load_effect.shape[2]
-    contact = np.zeros(b)
-    states = forces.covariance[:, None] + sizes[None, :, None, None] ** 2 * unit[:, None]
-    weights = np.zeros((b, len(sizes)))
-    weights[:, 0] = 1.0
-    inverse = np.linalg.inv(states)
-    information = np.where(sizes > 0.0, BLOCK_SECONDS / _MEAN_INTERVAL_S, 1.0)
-    prior = np.ones(k)
-    mean = spread = None
-    for _ in range(_MAX_ITERATIONS):
-        precision = np.einsum("bs,bsij->bij", weights * information, inverse)
-        walk = np.zeros((b, k))
-        walk[:, places] = contact[:, None] * BLOCK_SECONDS / _LOAD_CHANGE_S
-        mean, spread = _smooth_states(forces.force, observed, precision, prior, walk)
-        error = forces.force - np.einsum("bik,bk->bi", observed, mean)
-        doubt = np.einsum("bik,bkl,bjl->bij", observed, spread, observed)
-        likelihood = _log_normal(error, states + doubt[:, None])
-        load, load_error = _load_mass(mean, spread, places, load_std)
-        likelihood[:, 0] += np.minimum(0.0, math.log(2.0) + log_ndtr(load / load_error)) * information[1]
-        weights = _state_probabilities(likelihood)
-        last, contact = contact, 1.0 - weights[:, 0]
-        if np.abs(contact - last).max() < _TOLERANCE:
-            break
-    assert mean is not None and spread is not None
-    error = forces.force - np.einsum("bik,bk->bi", observed, mean)
-    doubt = np.einsum("bik,bkl,bjl->bij", observed, spread, observed)
+    states = _state_probabilities(forces, observed, load, sizes[:, None, None, None] ** 2 * unit, load_std)
+    task, probability = _TASKS[: forces.jacobian.shape[1]], states[:, _CONTACT]
+    mean, spread, error, doubt = _smooth_states(forces, observed, load, unit * sizes[-1] ** 2, states)
     force, force_std = _tip_force(forces, error, forces.covariance + doubt, sizes[-1])
-    load, load_error = _load_mass(mean, spread, places, load_std)
-    task = _TASKS[: forces.jacobian.shape[1]]
-    return Contact(run, forces.time, contact, task, force, force_std, load, load_error)
+    mass, mass_std = (load_std * v for v in _load_mass(mean, spread, load))
+    return Contact(run, forces.time, probability, states[:, _LOAD_CHANGES], task, force, force_std, mass, mass_std)
 
 
 def _observation_matrix(forces: ExternalForces, load_std: float) -> tuple[np.ndarray, slice]:
@@ -190,11 +182,10 @@ def _observation_matrix(forces: ExternalForces, load_std: float) -> tuple[np.nda
     return np.concatenate([reduced, load_std * forces.load_effect], axis=2), places
 
 
-def _load_mass(mean, spread, places: slice, load_std: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return mass of the load (b,) [kg] and its standard deviation."""
-    total = mean[:, places].sum(axis=1)
-    variance = spread[:, places, places].sum(axis=(1, 2))
-    return load_std * total, load_std * np.sqrt(np.maximum(variance, 1e-12))
+def _load_mass(mean: np.ndarray, spread: np.ndarray, load: slice) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mass of the load and its standard deviation (...,), relative to the load's prior standard deviation."""
+    variance = spread[..., load, load].sum(axis=(-2, -1))
+    return mean[..., load].sum(axis=-1), np.sqrt(np.maximum(variance, 1e-12))
 
 
 def _unit_force_covariance(forces: ExternalForces, machine: Machine) -> np.ndarray:
@@ -212,64 +203,126 @@ def _unit_force_covariance(forces: ExternalForces, machine: Machine) -> np.ndarr
 
 
 def _force_sizes(forces: ExternalForces, unit: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the tip force of each state [N]: 0, then from the noise up to what the drives can exert."""
+    """Return the tip forces of the components of the prior [N], from the noise up to what the drives can exert."""
     share = np.einsum("bij,bji->b", np.linalg.inv(forces.covariance), unit) / unit.shape[1]
     least = float(np.median(1.0 / np.sqrt(share)))
     valves = actuator_order(machine)[: len(machine.hydraulic_axes)]
     most = max(max_drive_force(machine, axis) for axis in valves if machine.axes[axis].cylinder)
     count = max(1, math.ceil(math.log(most / least, _SIZE_RATIO)))
-    return np.concatenate([[0.0], least * _SIZE_RATIO ** np.arange(count + 1)])
+    return least * _SIZE_RATIO ** np.arange(count + 1)
 
 
-def _log_normal(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the log density (b, s) of errors (b, n) under s covariances (b, s, n, n), up to a constant."""
-    _, size = np.linalg.slogdet(covariance)
-    solved = np.linalg.solve(covariance, np.broadcast_to(error[:, None, :, None], (*covariance.shape[:3], 1)))
-    return -0.5 * (size + np.einsum("bi,bsi->bs", error, solved[..., 0]))
+def _state_probabilities(
+    forces: ExternalForces, observed, load: slice, jump: np.ndarray, load_std: float
+) -> np.ndarray:
+    """Return the probabilities (b, 3) of the states free, load changes, and contact, by the filter and smoother of Kim.
 
-
-def _state_probabilities(likelihood: np.ndarray) -> np.ndarray:
-    """Return the probabilities (b, s) of the states by forward-backward recursions.
-
-    State 0 has no contact. Within contact, every size of the force is equally probable in every block.
-    """
-    b, s = likelihood.shape
-    stay = math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S)
-    pair = np.stack([likelihood[:, 0], logsumexp(likelihood[:, 1:], axis=1) - math.log(s - 1)], axis=1)
-    step = np.log(np.array([[stay, 1.0 - stay], [1.0 - stay, stay]]))
-    forward, backward = np.zeros((b, 2)), np.zeros((b, 2))
-    forward[0] = pair[0] - math.log(2.0)
-    for t in range(1, b):
-        forward[t] = pair[t] + logsumexp(forward[t - 1][:, None] + step, axis=0)
-    for t in range(b - 2, -1, -1):
-        backward[t] = logsumexp(step + (pair[t + 1] + backward[t + 1])[None], axis=1)
-    both = forward + backward
-    both = np.exp(both - logsumexp(both, axis=1)[:, None])
-    inside = np.exp(likelihood[:, 1:] - logsumexp(likelihood[:, 1:], axis=1)[:, None])
-    return np.concatenate([both[:, :1], both[:, 1:] * inside], axis=1)
-
-
-def _smooth_states(value, observed, precision, prior, walk) -> tuple[np.ndarray, np.ndarray]:
-    """Return means (b, k) and covariances (b, k, k) of a random walk by a Kalman filter and RTS smoother.
+    The continuous state holds parameter errors and load, of unit prior variance, and the external forces
+    of the contact. Without contact these forces are 0. In contact they change from block to block by a
+    mixture of normal distributions, and the load may change.
 
     Args:
-        value: (b, n) observations.
-        observed: (b, n, k) observation matrices.
-        precision: (b, n, n) inverse covariances of their errors.
-        prior: (k,) prior variances at the start.
-        walk: (b, k) variances of the change before each block.
+        forces: external forces.
+        observed: (b, n, k) effect of parameter errors and load.
+        load: columns of the load.
+        jump: (l, b, n, n) covariances of the change of force, the components of the mixture.
+        load_std: prior standard deviation of the load [kg].
     """
-    b, k = walk.shape
+    b, n, k = observed.shape
+    matrix = np.concatenate([observed, np.broadcast_to(np.eye(n), (b, n, n))], axis=2)
+    force, modes = slice(k, k + n), np.repeat([_FREE, _LOAD_CHANGES, _CONTACT], [1, 1, len(jump)])
+    step = np.full((3, 3), 0.5 * (1.0 - math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S)))
+    np.fill_diagonal(step, math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S))
+    share = step[:, modes] / np.where(modes == _CONTACT, len(jump), 1)  # of component c after each state
+    walk = np.zeros((len(modes), k + n, k + n))
+    walk[modes != _FREE, load, load] = np.eye(load.stop - load.start) * BLOCK_SECONDS / _LOAD_CHANGE_S
+    kept = np.ones((len(modes), k + n))
+    kept[modes != _CONTACT, force] = 0.0
+    mean, spread = np.zeros((3, k + n)), np.zeros((3, k + n, k + n))
+    spread[:, :k, :k] = np.eye(k)
+    spread[_CONTACT, force, force] = jump[:, 0].mean(axis=0)
+    filtered, predicted, now = np.zeros((b, 3)), np.zeros((b, 3)), np.full(3, 1.0 / 3.0)
+    for t in range(b):
+        predicted[t] = now @ step
+        walk[modes == _CONTACT, force, force] = jump[:, t]
+        x = mean[:, None] * kept
+        p = spread[:, None] * kept[:, :, None] * kept[:, None] + walk
+        x, p, fit = _update(
+            x.reshape(-1, k + n), p.reshape(-1, k + n, k + n), forces.force[t], matrix[t], forces.covariance[t],
+            load, load_std * forces.load_inertia[t],
+        )  # fmt: skip
+        weight = np.log(np.maximum(now[:, None] * share, 1e-300)).ravel() + fit
+        weight = np.exp(weight - weight.max())
+        for j in range(3):
+            some = np.tile(modes == j, 3)
+            now[j] = max(weight[some].sum(), 1e-300)
+            mean[j], spread[j] = _collapse(x[some], p[some], np.maximum(weight[some], 1e-300))
+        now = filtered[t] = now / now.sum()
+    out = filtered.copy()
+    for t in range(b - 2, -1, -1):
+        out[t] = filtered[t] * (step @ (out[t + 1] / predicted[t + 1]))
+        out[t] /= out[t].sum()
+    return out
+
+
+def _update(x, p, value, matrix, noise, load: slice, inertia) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Update c Gaussian states by one observation; also return the log likelihood (c,) of the observation.
+
+    The mass of the load is not negative: the likelihood is multiplied by the probability of a positive
+    mass after the observation over that before it. A load may move on the tool, so that its force of
+    inertia has its own size as standard deviation.
+    """
+    mass, mass_std = _load_mass(x, p, load)
+    before, moved = log_ndtr(mass / mass_std), np.maximum(mass, 0.0)[:, None] * inertia
+    cross = p @ matrix.T
+    total = matrix @ cross + noise + moved[:, :, None] * moved[:, None]
+    error = value - x @ matrix.T
+    solved = np.linalg.solve(total, np.concatenate([cross.transpose(0, 2, 1), error[:, :, None]], axis=2))
+    gain, weighted = solved[:, :, :-1], solved[:, :, -1]
+    x = x + np.einsum("cnk,cn->ck", gain, error)
+    p = p - cross @ gain
+    p = 0.5 * (p + p.transpose(0, 2, 1))
+    fit = -0.5 * (np.linalg.slogdet(total)[1] + np.einsum("cn,cn->c", error, weighted))
+    return x, p, fit + log_ndtr(np.divide(*_load_mass(x, p, load))) - before
+
+
+def _collapse(x: np.ndarray, p: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of a mixture of c Gaussian distributions."""
+    weight = weight / weight.sum()
+    mean = weight @ x
+    apart = x - mean
+    return mean, np.einsum("c,cij->ij", weight, p) + np.einsum("c,ci,cj->ij", weight, apart, apart)
+
+
+def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarray, states: np.ndarray):
+    """Estimate parameter errors and load by a Kalman filter and RTS smoother, given the probability of contact.
+
+    In contact, the forces are unknown, so that blocks in contact are not used.
+
+    Args:
+        forces: external forces.
+        observed: (b, n, k) effect of parameter errors and load.
+        load: columns of the load.
+        wide: (b, n, n) covariance of the force in contact.
+        states: (b, 3) probabilities of the states.
+
+    Returns:
+        Means (b, k) and covariances (b, k, k); external forces (b, n) without the effect of both, and
+        the covariance (b, n, n) of this effect.
+    """
+    b, _, k = observed.shape
+    walk = np.zeros((b, k))
+    walk[:, load] = (1.0 - states[:, _FREE, None]) * BLOCK_SECONDS / _LOAD_CHANGE_S
+    noise = forces.covariance + (states[:, _CONTACT] > 0.5)[:, None, None] * wide
     mean, spread = np.zeros((b, k)), np.zeros((b, k, k))
     ahead, ahead_spread = np.zeros((b, k)), np.zeros((b, k, k))
-    x, p = np.zeros(k), np.diag(prior)
+    x, p = np.zeros(k), np.eye(k)
     for t in range(b):
         p = p + np.diag(walk[t])
         ahead[t], ahead_spread[t] = x, p
         h = observed[t]
-        s = np.linalg.inv(precision[t]) + h @ p @ h.T
-        gain = np.linalg.solve(s, h @ p).T
-        x = x + gain @ (value[t] - h @ x)
+        gain = np.linalg.solve(h @ p @ h.T + noise[t], h @ p).T
+        x = x + gain @ (forces.force[t] - h @ x)
         p = p - gain @ h @ p
         p = 0.5 * (p + p.T)
         mean[t], spread[t] = x, p
@@ -277,7 +330,8 @@ def _smooth_states(value, observed, precision, prior, walk) -> tuple[np.ndarray,
         back = np.linalg.solve(ahead_spread[t + 1] + 1e-12 * np.eye(k), spread[t]).T
         mean[t] = mean[t] + back @ (mean[t + 1] - ahead[t + 1])
         spread[t] = spread[t] + back @ (spread[t + 1] - ahead_spread[t + 1]) @ back.T
-    return mean, spread
+    error = forces.force - np.einsum("bik,bk->bi", observed, mean)
+    return mean, spread, error, np.einsum("bik,bkl,bjl->bij", observed, spread, observed)
 
 
 def _tip_force(forces: ExternalForces, error, covariance, most: float) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from hydrotele.control.tip_balance import (
     ArmBalance,
@@ -28,7 +29,8 @@ from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Link, Machine
 from hydrotele.machine.sensors import SensorError
 
-BLOCK_SECONDS = 0.1  # [s] rows that are averaged; contact is detected with this resolution
+BLOCK_SECONDS = 0.1  # [s] time between blocks; contact is detected with this resolution
+FILTER_SECONDS = 0.3  # [s] window of the low-pass filter; shorter ones have larger noise of the acceleration
 _MIN_FORCE_CHANGE = 1e-3  # of the noise: a parameter with a smaller effect per standard deviation is omitted
 _TEST_MASS_KG = 100.0  # [kg] of the point masses by which the effect of a load is computed
 _LOAD_EFFECT = "payload"  # effect of the library that is treated as a load that may change
@@ -44,6 +46,7 @@ class ExternalForces:
         covariance: (b, n, n) of errors that are independent between blocks: noise and friction at rest.
         parameter_effect: (b, n, p) change per standard deviation of each constant parameter error.
         load_effect: (b, n, l) change per kilogram of a point mass at l places of the tool.
+        load_inertia: (b, n) part of it that is caused by rates and accelerations, mean of the places.
         jacobian: (b, m, n) derivatives of the tip's pose (r, theta, z, attitude, head) by the coordinates.
         radius: (b,) distance of the tip from the swing axis [m].
     """
@@ -53,6 +56,7 @@ class ExternalForces:
     covariance: np.ndarray
     parameter_effect: np.ndarray
     load_effect: np.ndarray
+    load_inertia: np.ndarray
     jacobian: np.ndarray
     radius: np.ndarray
 
@@ -86,20 +90,48 @@ def compute_balance_of_rows(arm, motion, pressure, rate_std, force, moment_arm):
 
 @dataclass(frozen=True)
 class _Motion:
-    """Smoothed motion and pressures of the rows of a run: positions, rates, accelerations (3, rows, n)."""
+    """Motion and pressures of the rows of a run.
+
+    Attributes:
+        value: (3, rows, n) smoothed positions and rates, and low-pass filtered accelerations.
+        std: (3, rows, n) their standard deviations.
+        pressure: (rows, h, 2) head and rod pressures [Pa], NaN where unknown.
+        pressure_std: (h, 2) noise of one reading [Pa].
+        weights: (w,) weights of the low-pass filter of the accelerations; the sum is 1.
+        centres: (b,) rows at the centres of the blocks, whose windows have complete readings.
+    """
 
     value: np.ndarray
     std: np.ndarray
     pressure: np.ndarray
     pressure_std: np.ndarray
+    weights: np.ndarray
+    centres: np.ndarray
 
-    def forces(self, arm: ArmBalance, change: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return external forces (rows, n) and moment arms (rows, h, n) with a changed motion."""
-        rows, n = self.value.shape[1:]
-        force, moment_arm = np.zeros((rows, n)), np.zeros((rows, self.pressure.shape[1], n))
-        moved = np.ascontiguousarray(self.value + change)
-        compute_balance_of_rows(arm, moved, self.pressure, np.ascontiguousarray(self.std[1]), force, moment_arm)
+    def forces(self, arm: ArmBalance, change: np.ndarray | float = 0.0) -> np.ndarray:
+        """Return the external forces (b, n) in the blocks with a changed motion.
+
+        All terms pass the low-pass filter of the accelerations, so that the balance holds at every frequency.
+        """
+        moved = self.value + change
+        still = moved * np.array([1.0, 1.0, 0.0])[:, None, None]
+        without = self.balance(arm, still)[0]
+        inertia = self.balance(arm, moved[:, self.centres], self.centres)[0] - without[self.centres]
+        return self.average(without) + inertia
+
+    def balance(self, arm: ArmBalance, value: np.ndarray, rows: np.ndarray | slice = slice(None)):
+        """Return external forces (rows, n) and moment arms (rows, h, n) of single rows."""
+        count, n = value.shape[1:]
+        force, moment_arm = np.zeros((count, n)), np.zeros((count, self.pressure.shape[1], n))
+        parts = (np.ascontiguousarray(part) for part in (value, self.pressure[rows], self.std[1, rows]))
+        compute_balance_of_rows(arm, *parts, force, moment_arm)
         return force, moment_arm
+
+    def average(self, values: np.ndarray) -> np.ndarray:
+        """Return the values (rows, ...) in the blocks (b, ...), averaged by the low-pass filter."""
+        half = len(self.weights) // 2
+        window = self.centres[:, None] + np.arange(-half, half + 1)
+        return np.einsum("w,bw...->b...", self.weights, values[window])
 
 
 def compute_external_forces(dataset: Dataset, run: RunData, record: IdentificationRecord) -> ExternalForces:
@@ -120,24 +152,25 @@ def compute_external_forces(dataset: Dataset, run: RunData, record: Identificati
     where = f"contact of {machine.name}"
     arm, free = create_arm_balance(machine, where), independent_axes(machine, where)
     motion = _smooth_motion(dataset, run, record, free, where)
-    average = _block_average(motion, record.period)
-    force, moment_arm = motion.forces(arm)
-    known = np.isfinite(average(force)).all(axis=1)
+    force = motion.forces(arm)
+    moment_arm = motion.balance(arm, motion.value)[1]
 
     def effect(changed: Machine, step: float) -> np.ndarray:
-        return (average(motion.forces(create_arm_balance(changed, where))[0] - force) / step)[known]
+        return (motion.forces(create_arm_balance(changed, where)) - force) / step
 
-    covariance = _noise_covariance(machine, motion, arm, moment_arm, force, average)[known]
+    covariance = _noise_covariance(machine, motion, arm, moment_arm, force)
     size = np.sqrt(np.einsum("bii->bi", covariance))
     columns = [column for changed, step in _changed_machines(machine)
-               if np.abs(column := effect(changed, step)).max(initial=0.0)
-               > _MIN_FORCE_CHANGE * size.min(initial=np.inf)]  # fmt: skip
-    loads = [effect(changed, -_TEST_MASS_KG) for changed in _loaded_machines(machine)]
-    pose = average(motion.value[0])[known]
-    jacobian, radius = _tip_jacobians(arm, pose, len(free))
-    time = average(run.start + record.period * (record.first_row + np.arange(len(force)))[:, None])[known, 0]
+               if (np.abs(column := effect(changed, step)) > _MIN_FORCE_CHANGE * size).any()]  # fmt: skip
+    loads = np.stack([effect(changed, -_TEST_MASS_KG) for changed in _loaded_machines(machine)], axis=2)
+    pose = -motion.value * np.array([0.0, 1.0, 1.0])[:, None, None]  # removes all rates and accelerations
+    at_rest = [motion.forces(create_arm_balance(changed, where), pose) for changed in _loaded_machines(machine)]
+    static = np.mean(at_rest, axis=0) - motion.forces(arm, pose)
+    jacobian, radius = _tip_jacobians(arm, motion.value[0, motion.centres], len(free))
+    time = run.start + record.period * (record.first_row + motion.centres)
     return ExternalForces(
-        time, average(force)[known], covariance, np.stack(columns, axis=2), np.stack(loads, axis=2), jacobian, radius,
+        time, force, covariance, np.stack(columns, axis=2), loads,
+        loads.mean(axis=2) + static / _TEST_MASS_KG, jacobian, radius,
     )  # fmt: skip
 
 
@@ -165,48 +198,40 @@ def _smooth_motion(dataset, run, record: IdentificationRecord, free: tuple[str, 
             std[i, side] = stated[channel] / error.scale
             if np.isnan(std[i, side]) and np.isfinite(column).sum() > 10:
                 std[i, side] = smooth_and_differentiate(column, run.period).noise[0]
-    value = np.stack([moved.value, moved.rate, moved.acceleration])
-    spread = np.stack([moved.value_std, moved.rate_std, moved.acceleration_std])
-    return _Motion(value, spread, pressure, std)
+    half = max(2, round(0.5 * FILTER_SECONDS / record.period))
+    if len(position) <= 2 * half:
+        raise InputError(where, f"{run.name} is too short: it needs more than {2 * half} rows")
+    second = savgol_coeffs(2 * half + 1, 2, deriv=2, delta=record.period, use="dot")
+    weights = np.append(0.0, np.cumsum(np.cumsum(second))[:-1]) * record.period**2  # its second difference is `second`
+    rows_known = np.arange(len(position))
+    filled = np.column_stack([np.interp(rows_known, rows_known[np.isfinite(c)], c[np.isfinite(c)]) for c in position.T])
+    acceleration = savgol_filter(filled, 2 * half + 1, 2, deriv=2, delta=record.period, axis=0)
+    value = np.stack([moved.value, moved.rate, acceleration])
+    spread = np.stack([moved.value_std, moved.rate_std, acceleration * 0.0 + moved.noise * np.linalg.norm(second)])
+    known = np.convolve(np.isfinite(pressure).all(axis=(1, 2)), np.ones(2 * half + 1), "same") > 2 * half + 0.5
+    centres = np.arange(half, len(position) - half, max(1, round(BLOCK_SECONDS / record.period)))
+    return _Motion(value, spread, pressure, std, weights, centres[known[centres]])
 
 
-def _block_average(motion: _Motion, period: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that averages rows (rows, ...) over blocks; NaN for blocks without a complete row."""
-    rows = motion.value.shape[1]
-    count = max(1, round(BLOCK_SECONDS / period))
-    known = np.isfinite(motion.pressure).all(axis=(1, 2))
-    block = np.arange(rows) // count
-    total = np.bincount(block, known)
-
-    def average(values: np.ndarray) -> np.ndarray:
-        flat = np.where(known[:, None], values.reshape(rows, -1), 0.0)
-        sums = np.zeros((len(total), flat.shape[1]))
-        np.add.at(sums, block, flat)
-        with np.errstate(invalid="ignore"):
-            return (sums / total[:, None]).reshape(len(total), *values.shape[1:])
-
-    return average
-
-
-def _noise_covariance(machine, motion: _Motion, arm: ArmBalance, moment_arm, force, average) -> np.ndarray:
-    """Return the covariance (b, n, n) of the mean force of a block by noise and by friction at rest.
+def _noise_covariance(machine: Machine, motion: _Motion, arm: ArmBalance, moment_arm, force) -> np.ndarray:
+    """Return the covariance (b, n, n) of the force of a block by noise and by friction at rest.
 
     The noise of pressures is independent between rows. That of the smoothed motion and the friction of a
     drive at rest are the same in all rows of a block. The friction of a drive at rest has the breakaway
     friction as its standard deviation.
     """
-    n, count = force.shape[1], len(force) / len(average(force))
-    causes = []
+    n, causes = force.shape[1], []
     for order in range(3):
         for f in range(n):
             change = np.zeros_like(motion.value)
             change[order, :, f] = motion.std[order, :, f]
-            causes.append(average(motion.forces(arm, change)[0] - force))
+            causes.append(motion.forces(arm, change) - force)
     valves = actuator_order(machine)[: motion.pressure.shape[1]]
     for i, axis in enumerate(valves):
         for side, area in enumerate(machine.axes[axis].hydraulic_drive.effective_areas):
-            causes.append(average(moment_arm[:, i]) * area * motion.pressure_std[i, side] / np.sqrt(count))
-        causes.append(average(moment_arm[:, i] * _unknown_friction(arm, motion, moment_arm, i)[:, None]))
+            noise = area * motion.pressure_std[i, side] * np.linalg.norm(motion.weights)
+            causes.append(motion.average(moment_arm[:, i]) * noise)
+        causes.append(motion.average(moment_arm[:, i] * _unknown_friction(arm, motion, moment_arm, i)[:, None]))
     return sum(np.einsum("bi,bj->bij", cause, cause) for cause in causes)  # pyright: ignore[reportReturnType]
 
 
