@@ -21,6 +21,8 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from hydrotele.control.log_forces import BLOCK_SECONDS, FILTER_SECONDS, ExternalForces, compute_external_forces
+from hydrotele.control.tip_balance import arm_joints
+from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.effects.effect import max_drive_force
 from hydrotele.hydraulics.actuator_layout import actuator_order
@@ -113,6 +115,7 @@ def detect_contact(
     Raises:
         InputError: the machine has no arm, or a position or pressure is not in the logs.
     """
+    _check_pressures(files, machine)
     data, origin = _prepare_runs(files, machine, sensors, masks)
     records, last, _ = build_records(data)
     runs = (*data.fit, data.heldout)
@@ -134,6 +137,24 @@ def contact_masks(found: Sequence[Contact], files: Sequence[RunFiles]) -> tuple[
 def find_contact_rows(found: Contact, time: np.ndarray) -> np.ndarray:
     """Return for each time (n,) [s] of a run whether the tool is in contact."""
     return ~find_unmasked_rows([MaskedInterval("", *pair) for pair in found.find_intervals(found.is_contact)], "", time)
+
+
+def _check_pressures(files: Sequence[RunFiles], machine: Machine) -> None:
+    """Check that the machine has an arm, and that the logs of all runs contain the pressures of all valves.
+
+    Raises:
+        InputError: the machine has no arm, or a pressure is missing.
+    """
+    where = f"contact of {machine.name}"
+    arm_joints(machine)
+    for run in files:
+        missing = [channel for axis in machine.hydraulic_axes for side in ("head", "rod")
+                   if not any((channel := f"pressure_{side}.{axis}") in log for log in run.logs)]  # fmt: skip
+        if missing:
+            message = (
+                f"run {run.name} has no {', '.join(missing)}: log both pressures of every drive, or omit --contact"
+            )
+            raise InputError(where, message)
 
 
 def _prepare_runs(files, machine, sensors, masks) -> tuple[Dataset, dict[str, str]]:
@@ -183,7 +204,7 @@ def _observation_matrix(forces: ExternalForces, load_std: float) -> tuple[np.nda
 
 
 def _load_mass(mean: np.ndarray, spread: np.ndarray, load: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mass of the load and its standard deviation (...,), relative to the load's prior standard deviation."""
+    """Return mass and standard deviation (...,) of the load, relative to the prior standard deviation of its mass."""
     variance = spread[..., load, load].sum(axis=(-2, -1))
     return mean[..., load].sum(axis=-1), np.sqrt(np.maximum(variance, 1e-12))
 
@@ -207,7 +228,7 @@ def _force_sizes(forces: ExternalForces, unit: np.ndarray, machine: Machine) -> 
     share = np.einsum("bij,bji->b", np.linalg.inv(forces.covariance), unit) / unit.shape[1]
     least = float(np.median(1.0 / np.sqrt(share)))
     valves = actuator_order(machine)[: len(machine.hydraulic_axes)]
-    most = max(max_drive_force(machine, axis) for axis in valves if machine.axes[axis].cylinder)
+    most = max((max_drive_force(machine, a) for a in valves if machine.axes[a].cylinder), default=least)
     count = max(1, math.ceil(math.log(most / least, _SIZE_RATIO)))
     return least * _SIZE_RATIO ** np.arange(count + 1)
 

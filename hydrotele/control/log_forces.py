@@ -5,7 +5,6 @@ of a run. The result contains the variance of each cause: pressure noise, noise 
 unknown friction of drives at rest, and the sensitivity to constant errors of the machine's parameters.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,7 +174,11 @@ def compute_external_forces(dataset: Dataset, run: RunData, record: Identificati
 
 
 def _smooth_motion(dataset, run, record: IdentificationRecord, free: tuple[str, ...], where: str) -> _Motion:
-    """Return the smoothed motion of the coordinates and the corrected pressures of a run."""
+    """Return the smoothed motion of the coordinates and the corrected pressures of a run.
+
+    Accelerations are the second derivatives of parabolas fitted to a window. The weights with which they average the
+    true acceleration have the coefficients of this filter as their second difference.
+    """
     machine = dataset.machine
     places = [record.axes.index(name) for name in free]
     noise = record.position_noise[places]
@@ -189,9 +192,6 @@ def _smooth_motion(dataset, run, record: IdentificationRecord, free: tuple[str, 
     for i, axis in enumerate(valves):
         for side, name in enumerate(("head", "rod")):
             channel = f"pressure_{name}.{axis}"
-            if channel not in stated:
-                raise InputError(where, f"{channel} is not in the logs: the force at the tip follows from both pressures of"
-                                 " every drive of the arm")  # fmt: skip
             column = run.reading[rows, dataset.channels.index(channel)]
             error = machine.sensor_errors.get(channel, SensorError())
             pressure[:, i, side] = correct_sensor_error(column, error, run.period, run.start)
@@ -201,13 +201,14 @@ def _smooth_motion(dataset, run, record: IdentificationRecord, free: tuple[str, 
     half = max(2, round(0.5 * FILTER_SECONDS / record.period))
     if len(position) <= 2 * half:
         raise InputError(where, f"{run.name} is too short: it needs more than {2 * half} rows")
-    second = savgol_coeffs(2 * half + 1, 2, deriv=2, delta=record.period, use="dot")
+    second = np.asarray(savgol_coeffs(2 * half + 1, 2, deriv=2, delta=record.period, use="dot"))
     weights = np.append(0.0, np.cumsum(np.cumsum(second))[:-1]) * record.period**2  # its second difference is `second`
     rows_known = np.arange(len(position))
     filled = np.column_stack([np.interp(rows_known, rows_known[np.isfinite(c)], c[np.isfinite(c)]) for c in position.T])
-    acceleration = savgol_filter(filled, 2 * half + 1, 2, deriv=2, delta=record.period, axis=0)
+    acceleration = np.asarray(savgol_filter(filled, 2 * half + 1, 2, deriv=2, delta=record.period, axis=0))
     value = np.stack([moved.value, moved.rate, acceleration])
-    spread = np.stack([moved.value_std, moved.rate_std, acceleration * 0.0 + moved.noise * np.linalg.norm(second)])
+    noise = np.broadcast_to(moved.noise * np.linalg.norm(second), position.shape)
+    spread = np.stack([moved.value_std, moved.rate_std, noise])
     known = np.convolve(np.isfinite(pressure).all(axis=(1, 2)), np.ones(2 * half + 1), "same") > 2 * half + 0.5
     centres = np.arange(half, len(position) - half, max(1, round(BLOCK_SECONDS / record.period)))
     return _Motion(value, spread, pressure, std, weights, centres[known[centres]])
@@ -236,7 +237,7 @@ def _noise_covariance(machine: Machine, motion: _Motion, arm: ArmBalance, moment
 
 
 def _unknown_friction(arm: ArmBalance, motion: _Motion, moment_arm: np.ndarray, i: int) -> np.ndarray:
-    """Return the standard deviation (rows,) of the friction of valve i's drive, whose motion is uncertain [N] or [N m]."""
+    """Return the standard deviation (rows,) of the friction of valve i's drive at uncertain velocity [N] or [N m]."""
     user, u = arm.model.user, i * SLOT_COUNT
     velocity = np.einsum("tn,tn->t", moment_arm[:, i], motion.value[1])
     variance = np.einsum("tn,tn->t", moment_arm[:, i] ** 2, motion.std[1] ** 2)
@@ -277,7 +278,8 @@ def _loaded_machines(machine: Machine):
     outer = np.array(tip.position)
     side = np.array([-outer[2], 0.0, outer[0]])
     for place in (np.zeros(3), outer, 0.5 * (outer + side)):
-        link = Link(parent=tip.link, position=tuple(place), mass=_TEST_MASS_KG, inertia=(1e-3,) * 3)
+        x, y, z = map(float, place)
+        link = Link(parent=tip.link, position=(x, y, z), mass=_TEST_MASS_KG, inertia=(1e-3, 1e-3, 1e-3))
         yield machine.model_copy(update={"links": {**machine.links, PAYLOAD: link}})
 
 
