@@ -187,6 +187,7 @@ def _unbox_reference(kind, value, c):
         """Emit code that releases the arrays after the call: a reference, an opaque pointer, does not do it."""
         if native.cleanup is not None:
             native.cleanup()
-        c.context.nrt.decref(c.builder, kind.record, native.value)
+        if c.context.enable_nrt:  # otherwise unboxing takes no references
+            c.context.nrt.decref(c.builder, kind.record, native.value)
 
     return NativeValue(_hide_origin(c.builder, space), native.is_error, release)
