@@ -113,7 +113,7 @@ def compare_models(
     machines: Sequence[str], data: Sequence[Path], tool: str | None, heldout: str | None,
     sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], include_fitted: bool,
     target: Path | None, as_json: bool, force: bool = False, bands: int | None = None,
-    contact: ContactOption = "ignore",
+    contact: ContactOption = "mask",
 ) -> dict[str, Any]:  # fmt: skip
     """Compare open-loop predictions of several models on runs that were not used to fit them.
 

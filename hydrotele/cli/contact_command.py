@@ -11,8 +11,9 @@ import numpy as np
 from hydrotele.cli.console import make_table, print_json, print_notes, stdout_console, write_json
 from hydrotele.cli.input_logs import open_logs
 from hydrotele.control.contact import Contact, contact_masks, detect_contact
+from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
-from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
+from hydrotele.logs.dataset import Dataset, make_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.logs.masked_intervals import MaskedInterval, find_unmasked_rows, read_mask
 from hydrotele.logs.run_files import RunFiles, read_runs
@@ -33,26 +34,34 @@ def load_dataset_without_contact(
         sensors: name of the sensor set, None for that named by the logs.
         heldout: name of the held-out run, None to choose one.
         force: accept logs whose metadata name another machine or tool.
-        contact: `mask` to detect and mask these intervals, `ignore` to use all rows.
+        contact: `mask` to detect and mask these intervals, `ignore` to use all rows. All rows of a machine
+            without an arm with cylinders, or of logs without positions or pressures, are used.
         mask: CSV file of further masked intervals.
 
     Returns:
-        The dataset; its notes state the masked time of each run.
+        The dataset; its notes state the masked time of each run, or why contact cannot be detected.
 
     Raises:
-        InputError: the logs are not usable, or contact cannot be detected in them.
+        InputError: the logs are not usable.
     """
-    if contact == "ignore":
-        return load_dataset(list(data), machine, sensors, heldout, force=force, mask=mask)
     files = read_runs(list(data), machine, machine.log_columns, force)
     given = read_mask(mask) if mask else ()
-    found = detect_contact(files, machine, sensors, given)
-    dataset = make_dataset(files, machine, sensors, heldout, (*given, *contact_masks(found, files)))
+    whole = make_dataset(files, machine, sensors, heldout, given)
+    if contact == "ignore" or machine.arm is None or not machine.hydraulic_axes:
+        return whole
+    try:
+        found = detect_contact(files, machine, sensors, given)
+    except InputError as error:
+        return dataclasses.replace(whole, notes=(f"Contact is not detected: {error}.", *whole.notes))
+    masks = contact_masks(found, files)
+    if not masks:
+        return whole
+    dataset = make_dataset(files, machine, sensors, heldout, (*given, *masks))
     notes = tuple(
         f"{name}: contact is detected in {row['contact_s']:.1f} s and a load on the tool in {row['loaded_s']:.1f} s"
-        f" of {row['duration_s']:.1f} s; these intervals are masked."
-        for name, row in summarise_contact(found).items()
-    )
+        f" of {row['duration_s']:.1f} s; these intervals are masked (--contact ignore uses them)."
+        for name, row in summarise_contact(found).items() if row["contact_s"] or row["loaded_s"]
+    )  # fmt: skip
     return dataclasses.replace(dataset, notes=(*notes, *dataset.notes))
 
 

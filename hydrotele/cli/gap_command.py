@@ -55,7 +55,7 @@ def gap_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, recording: bool,
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
-    mask: Path | None = None, method: Method = "search", contact: ContactOption = "ignore",
+    mask: Path | None = None, method: Method = "search", contact: ContactOption = "mask",
 ) -> Path:  # fmt: skip
     """Find the effects that explain the differences (gap) between a machine model and its logs.
 

@@ -102,7 +102,7 @@ class IdentificationOptions:
 def identify_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, choices: IdentificationOptions,
-    force: bool = False, contact: ContactOption = "ignore",
+    force: bool = False, contact: ContactOption = "mask",
 ) -> Path:  # fmt: skip
     """Identify masses, friction and, if requested, hydraulics of a machine from logs.
 

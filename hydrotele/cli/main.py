@@ -77,8 +77,8 @@ Black-box models, fitted on the other runs (--baseline, repeatable):
 
 
 ContactChoice = Annotated[
-    Literal["ignore", "mask"],
-    typer.Option("--contact", help="Mask intervals in which pressures show contact or a load of the tool."),
+    Literal["mask", "ignore"],
+    typer.Option("--contact", help="Mask intervals in which pressures show contact or a load of the tool, or use them."),
 ]
 
 
@@ -109,7 +109,7 @@ def compare(
         ),
     ] = None,
     effects: EffectFilesOption = None,
-    contact: ContactChoice = "ignore",
+    contact: ContactChoice = "mask",
     force: Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
@@ -350,7 +350,7 @@ def gap(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
     mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
-    contact: ContactChoice = "ignore",
+    contact: ContactChoice = "mask",
     force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     method: Annotated[
@@ -370,7 +370,7 @@ def gap(
     model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
-                       "--force": force, "--contact": contact != "ignore"}  # fmt: skip
+                       "--force": force, "--contact": contact != "mask"}  # fmt: skip
         if strange := [option for option, value in of_machines.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
@@ -426,7 +426,7 @@ def identify(
     truncate: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Discard singular values below this fraction of the largest.")
     ] = 0.0,
-    contact: ContactChoice = "ignore",
+    contact: ContactChoice = "mask",
     force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -456,7 +456,7 @@ def identify(
         given = {
             "--machine": machine, "--tool": tool, "--sensors": sensors, "--reduced": reduced,
             "--pins": pins, "--asymmetry": asymmetry, "--hydraulics": hydraulics,
-            "--contact": contact != "ignore",
+            "--contact": contact != "mask",
         }  # fmt: skip
         if strange := [option for option, value in given.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it with --mjcf")

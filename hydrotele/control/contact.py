@@ -1,16 +1,17 @@
 """Detection of contact of the tool with its environment in logs, from the pressures of the drives.
 
-The external forces on the arm (`control.log_forces`) are y = H a + L m + J' f + noise in each block of
-0.1 s. The parameter errors a of the machine are constant. The masses m of a load on the tool are constant
-while the tool is free, and may change in contact. The tip force f is 0 while the tool is free.
+The external forces on the arm (`control.log_forces`) are y = H a + L m + R e + J' f + noise in each block
+of 0.1 s. The parameter errors a of the machine are constant. The masses m of a load on the tool are constant
+while the tool is free. The tip force f is 0 without contact. An unmodelled force e of one drive, such as the
+friction of a scored bore, is a difference between machine and model and not contact.
 
-A hidden Markov model has one state without contact, and states of contact with tip forces of
-different sizes, so that the prior of the size is uniform in its logarithm. Forward-backward
-recursions give the probability of contact, and a Kalman smoother gives a and m. Both are repeated until the
-probabilities are constant (structured variational approximation).
+The tool has four states: free, free while the load changes, free with an unmodelled force of one drive, and contact,
+in which the load may change as well. The prior of the size of a force is uniform in its logarithm. The filter and
+smoother of Kim give the probabilities of the states, and a Kalman smoother then gives a and m. A force
+that acts on several drives is contact, because no single drive explains it. One that acts on a single drive is
+more probable as an unmodelled force, which has fewer free components.
 
-Sources: Rabiner 1989, Proc. IEEE 77(2) (hidden Markov model); Ghahramani and Hinton 2000, Neural
-Computation 12(4) (switching state-space model).
+Source: Kim 1994, Journal of Econometrics 60 (switching state-space model).
 """
 
 import math
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from hydrotele.control.log_forces import BLOCK_SECONDS, FILTER_SECONDS, ExternalForces, compute_external_forces
+from hydrotele.control.log_forces import BLOCK_SECONDS, ExternalForces, compute_external_forces
 from hydrotele.control.tip_balance import arm_joints
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
@@ -43,11 +44,11 @@ from hydrotele.logs.resampling import average_rows
 from hydrotele.logs.run_files import RunFiles
 from hydrotele.machine.machine import Machine
 
-_FREE, _LOAD_CHANGES, _CONTACT = range(3)  # states of the tool
+_FREE, _LOAD_CHANGES, _CONTACT, _DRIVE_FORCE = range(4)  # states of the tool; the last is followed by other drives
 _TASKS = ("r", "theta", "z", "attitude", "head")
 _MEAN_INTERVAL_S = 3.0  # [s] prior mean duration of contact, and of the time between contacts
 _LOAD_CHANGE_S = 1.0  # [s] time in which a load in contact may change by its prior standard deviation
-_SIZE_RATIO = 2.0  # ratio of the tip forces of neighbouring states of contact
+_SIZE_RATIO = 2.0  # ratio of neighbouring sizes of a force in its prior
 _SIGNIFICANT_STD = 3.0  # standard deviations by which a load exceeds the smallest one of the run
 _MIN_SINGULAR_RATIO = 1e-3  # smaller singular values of the parameter effects over the noise are omitted
 
@@ -64,7 +65,8 @@ class Contact:
         task: names of the m task coordinates of the force.
         force: (b, m) force of the environment on the tip [N] or [N m].
         force_std: (b, m) its standard deviation, with the uncertainty of machine and load.
-        load: (b,) mass of the load on the tool [kg].
+        load: (b,) mass of the load on the tool, less the smallest load of the run [kg]. A constant load cannot be
+            distinguished from errors of the machine's masses.
         load_std: (b,) its standard deviation [kg].
     """
 
@@ -86,14 +88,12 @@ class Contact:
     @property
     def is_loaded(self) -> np.ndarray:
         """Whether the tool is free, and its load changes or is significantly larger than the smallest load (b,)."""
-        least = int(np.argmin(self.load))
-        more = self.load - self.load[least] > _SIGNIFICANT_STD * np.hypot(self.load_std, self.load_std[least])
-        return ~self.is_contact & (more | (self.load_change > 0.5))
+        return ~self.is_contact & ((self.load > _SIGNIFICANT_STD * self.load_std) | (self.load_change > 0.5))
 
     def find_intervals(self, marked: np.ndarray) -> list[tuple[float, float]]:
-        """Return start and end [s] of the intervals of marked blocks (b,), with the windows of their filter."""
+        """Return start and end [s] of the intervals of marked blocks (b,)."""
         edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
-        half = 0.5 * FILTER_SECONDS
+        half = 0.5 * BLOCK_SECONDS
         return [(float(self.time[a]) - half, float(self.time[b - 1]) + half)
                 for a, b in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
 
@@ -179,12 +179,21 @@ def _detect_in_run(forces: ExternalForces, machine: Machine, run: str) -> Contac
     load_std = next(iter(EFFECTS["payload"].parameters(machine, "tool").values())).prior_std
     observed, load = _observation_matrix(forces, load_std)
     unit = _unit_force_covariance(forces, machine)
-    sizes = _force_sizes(forces, unit, machine)
-    states = _state_probabilities(forces, observed, load, sizes[:, None, None, None] ** 2 * unit, load_std)
+    valves = actuator_order(machine)[: len(machine.hydraulic_axes)]
+    largest = [max_drive_force(machine, axis) for axis in valves]
+    cylinders = [force for axis, force in zip(valves, largest, strict=True) if machine.axes[axis].cylinder]
+    sizes = _force_sizes(forces, unit, max(cylinders, default=0.0))
+    contact = sizes[:, None, None, None] ** 2 * unit
+    drives = [np.einsum("bi,bj->bij", arm, arm) for arm in np.moveaxis(forces.moment_arm, 1, 0)]
+    jumps = [contact, *(_force_sizes(forces, one, most)[:, None, None, None] ** 2 * one
+                        for one, most in zip(drives, largest, strict=True))]  # fmt: skip
+    states = _state_probabilities(forces, observed, load, jumps, load_std)
     task, probability = _TASKS[: forces.jacobian.shape[1]], states[:, _CONTACT]
     mean, spread, error, doubt = _smooth_states(forces, observed, load, unit * sizes[-1] ** 2, states)
     force, force_std = _tip_force(forces, error, forces.covariance + doubt, sizes[-1])
     mass, mass_std = (load_std * v for v in _load_mass(mean, spread, load))
+    least = int(np.argmin(mass))
+    mass, mass_std = mass - mass[least], np.hypot(mass_std, mass_std[least])
     return Contact(run, forces.time, probability, states[:, _LOAD_CHANGES], task, force, force_std, mass, mass_std)
 
 
@@ -223,59 +232,67 @@ def _unit_force_covariance(forces: ExternalForces, machine: Machine) -> np.ndarr
     return np.einsum("bmi,bmj->bij", moved, moved)
 
 
-def _force_sizes(forces: ExternalForces, unit: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the tip forces of the components of the prior [N], from the noise up to what the drives can exert."""
-    share = np.einsum("bij,bji->b", np.linalg.inv(forces.covariance), unit) / unit.shape[1]
+def _force_sizes(forces: ExternalForces, unit: np.ndarray, largest: float) -> np.ndarray:
+    """Return the sizes of a force in its prior, from its noise up to the largest one [N] or [N m].
+
+    `unit` (b, n, n) is the covariance of external forces for a force of size 1.
+    """
+    directions = np.linalg.matrix_rank(unit[0])
+    share = np.einsum("bij,bji->b", np.linalg.inv(forces.covariance), unit) / directions
     least = float(np.median(1.0 / np.sqrt(share)))
-    valves = actuator_order(machine)[: len(machine.hydraulic_axes)]
-    most = max((max_drive_force(machine, a) for a in valves if machine.axes[a].cylinder), default=least)
-    count = max(1, math.ceil(math.log(most / least, _SIZE_RATIO)))
+    count = max(1, math.ceil(math.log(max(largest / least, 1.0), _SIZE_RATIO)))
     return least * _SIZE_RATIO ** np.arange(count + 1)
 
 
 def _state_probabilities(
-    forces: ExternalForces, observed, load: slice, jump: np.ndarray, load_std: float
+    forces: ExternalForces, observed, load: slice, jumps: Sequence[np.ndarray], load_std: float
 ) -> np.ndarray:
-    """Return the probabilities (b, 3) of the states free, load changes, and contact, by the filter and smoother of Kim.
+    """Return the probabilities (b, 3 + h) of the states of the tool by the filter and smoother of Kim.
 
     The continuous state holds parameter errors and load, of unit prior variance, and the external forces
-    of the contact. Without contact these forces are 0. In contact they change from block to block by a
-    mixture of normal distributions, and the load may change.
+    of a contact or of one drive. In the other states these forces are 0. They change from block to block by a
+    mixture of normal distributions. In contact the load may change as well.
 
     Args:
         forces: external forces.
         observed: (b, n, k) effect of parameter errors and load.
         load: columns of the load.
-        jump: (l, b, n, n) covariances of the change of force, the components of the mixture.
+        jumps: covariances (l, b, n, n) of the change of external forces, the l components of the mixture; first of
+            the contact, then of each drive.
         load_std: prior standard deviation of the load [kg].
     """
     b, n, k = observed.shape
     matrix = np.concatenate([observed, np.broadcast_to(np.eye(n), (b, n, n))], axis=2)
-    force, modes = slice(k, k + n), np.repeat([_FREE, _LOAD_CHANGES, _CONTACT], [1, 1, len(jump)])
-    step = np.full((3, 3), 0.5 * (1.0 - math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S)))
-    np.fill_diagonal(step, math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S))
-    share = step[:, modes] / np.where(modes == _CONTACT, len(jump), 1)  # of component c after each state
+    force = slice(k, k + n)
+    modes = np.repeat(range(2 + len(jumps)), [1, 1, *map(len, jumps)])
+    jump, states = np.concatenate(jumps), 2 + len(jumps)
+    entry = np.array([1.0, 1.0, 1.0, *[1.0 / (states - _DRIVE_FORCE)] * (states - _DRIVE_FORCE)])
+    stay = math.exp(-BLOCK_SECONDS / _MEAN_INTERVAL_S)
+    step = np.tile(entry, (states, 1)) * (1.0 - np.eye(states))
+    step = (1.0 - stay) * step / step.sum(axis=1, keepdims=True) + stay * np.eye(states)
+    share = step[:, modes] / np.bincount(modes)[modes]  # of component c after each state
     walk = np.zeros((len(modes), k + n, k + n))
-    walk[modes != _FREE, load, load] = np.eye(load.stop - load.start) * BLOCK_SECONDS / _LOAD_CHANGE_S
-    kept = np.ones((len(modes), k + n))
-    kept[modes != _CONTACT, force] = 0.0
-    mean, spread = np.zeros((3, k + n)), np.zeros((3, k + n, k + n))
+    changes = (modes == _LOAD_CHANGES) | (modes == _CONTACT)
+    walk[changes, load, load] = np.eye(load.stop - load.start) * BLOCK_SECONDS / _LOAD_CHANGE_S
+    kept = np.ones((states, len(modes), k + n))
+    kept[np.arange(states)[:, None] != modes, force] = 0.0  # a state begins without force
+    mean, spread = np.zeros((states, k + n)), np.zeros((states, k + n, k + n))
     spread[:, :k, :k] = np.eye(k)
-    spread[_CONTACT, force, force] = jump[:, 0].mean(axis=0)
-    filtered, predicted, now = np.zeros((b, 3)), np.zeros((b, 3)), np.full(3, 1.0 / 3.0)
+    spread[_CONTACT, force, force] = jumps[0][:, 0].mean(axis=0)
+    filtered, predicted, now = np.zeros((b, states)), np.zeros((b, states)), entry / entry.sum()
     for t in range(b):
         predicted[t] = now @ step
-        walk[modes == _CONTACT, force, force] = jump[:, t]
+        walk[modes >= _CONTACT, force, force] = jump[:, t]
         x = mean[:, None] * kept
-        p = spread[:, None] * kept[:, :, None] * kept[:, None] + walk
+        p = spread[:, None] * kept[..., :, None] * kept[..., None, :] + walk
         x, p, fit = _update(
             x.reshape(-1, k + n), p.reshape(-1, k + n, k + n), forces.force[t], matrix[t], forces.covariance[t],
             load, load_std * forces.load_inertia[t],
         )  # fmt: skip
         weight = np.log(np.maximum(now[:, None] * share, 1e-300)).ravel() + fit
         weight = np.exp(weight - weight.max())
-        for j in range(3):
-            some = np.tile(modes == j, 3)
+        for j in range(states):
+            some = np.tile(modes == j, states)
             now[j] = max(weight[some].sum(), 1e-300)
             mean[j], spread[j] = _collapse(x[some], p[some], np.maximum(weight[some], 1e-300))
         now = filtered[t] = now / now.sum()
@@ -316,16 +333,14 @@ def _collapse(x: np.ndarray, p: np.ndarray, weight: np.ndarray) -> tuple[np.ndar
 
 
 def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarray, states: np.ndarray):
-    """Estimate parameter errors and load by a Kalman filter and RTS smoother, given the probability of contact.
-
-    In contact, the forces are unknown, so that blocks in contact are not used.
+    """Estimate parameter errors and load by a Kalman filter and RTS smoother, given the states of the tool.
 
     Args:
         forces: external forces.
         observed: (b, n, k) effect of parameter errors and load.
         load: columns of the load.
-        wide: (b, n, n) covariance of the force in contact.
-        states: (b, 3) probabilities of the states.
+        wide: (b, n, n) covariance of an unknown force, of a contact or of a drive.
+        states: (b, 3 + h) probabilities of the states.
 
     Returns:
         Means (b, k) and covariances (b, k, k); external forces (b, n) without the effect of both, and
@@ -333,8 +348,10 @@ def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarr
     """
     b, _, k = observed.shape
     walk = np.zeros((b, k))
-    walk[:, load] = (1.0 - states[:, _FREE, None]) * BLOCK_SECONDS / _LOAD_CHANGE_S
-    noise = forces.covariance + (states[:, _CONTACT] > 0.5)[:, None, None] * wide
+    changes = states[:, _LOAD_CHANGES] + states[:, _CONTACT]
+    walk[:, load] = changes[:, None] * BLOCK_SECONDS / _LOAD_CHANGE_S
+    other = states[:, _CONTACT:].sum(axis=1) > 0.5  # blocks with an unknown force are not used
+    noise = forces.covariance + other[:, None, None] * wide
     mean, spread = np.zeros((b, k)), np.zeros((b, k, k))
     ahead, ahead_spread = np.zeros((b, k)), np.zeros((b, k, k))
     x, p = np.zeros(k), np.eye(k)

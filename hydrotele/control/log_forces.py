@@ -46,6 +46,7 @@ class ExternalForces:
         parameter_effect: (b, n, p) change per standard deviation of each constant parameter error.
         load_effect: (b, n, l) change per kilogram of a point mass at l places of the tool.
         load_inertia: (b, n) part of it that is caused by rates and accelerations, mean of the places.
+        moment_arm: (b, h, n) derivatives of the strokes of the h valves' drives by the coordinates.
         jacobian: (b, m, n) derivatives of the tip's pose (r, theta, z, attitude, head) by the coordinates.
         radius: (b,) distance of the tip from the swing axis [m].
     """
@@ -56,6 +57,7 @@ class ExternalForces:
     parameter_effect: np.ndarray
     load_effect: np.ndarray
     load_inertia: np.ndarray
+    moment_arm: np.ndarray
     jacobian: np.ndarray
     radius: np.ndarray
 
@@ -169,7 +171,7 @@ def compute_external_forces(dataset: Dataset, run: RunData, record: Identificati
     time = run.start + record.period * (record.first_row + motion.centres)
     return ExternalForces(
         time, force, covariance, np.stack(columns, axis=2), loads,
-        loads.mean(axis=2) + static / _TEST_MASS_KG, jacobian, radius,
+        loads.mean(axis=2) + static / _TEST_MASS_KG, motion.average(moment_arm), jacobian, radius,
     )  # fmt: skip
 
 
