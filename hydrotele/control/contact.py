@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import expit, log_ndtr
 
 from hydrotele.control.log_forces import BLOCK_SECONDS, ExternalForces, compute_external_forces
 from hydrotele.control.tip_balance import arm_joints
@@ -49,7 +49,6 @@ _TASKS = ("r", "theta", "z", "attitude", "head")
 _MEAN_INTERVAL_S = 3.0  # [s] prior mean duration of contact, and of the time between contacts
 _LOAD_CHANGE_S = 1.0  # [s] time in which a load in contact may change by its prior standard deviation
 _SIZE_RATIO = 2.0  # ratio of neighbouring sizes of a force in its prior
-_SIGNIFICANT_STD = 3.0  # standard deviations by which a load exceeds the smallest one of the run
 _MIN_SINGULAR_RATIO = 1e-3  # smaller singular values of the parameter effects over the noise are omitted
 
 
@@ -61,7 +60,8 @@ class Contact:
         run: name of the run in the data.
         time: (b,) mean time of each block [s].
         probability: (b,) probability of contact [1].
-        load_change: (b,) probability that the load changes without contact, as when a bucket is emptied [1].
+        load_probability: (b,) probability that the load is larger than the smallest load of the run, or changes
+            without contact, as when a bucket is emptied [1].
         task: names of the m task coordinates of the force.
         force: (b, m) force of the environment on the tip [N] or [N m].
         force_std: (b, m) its standard deviation, with the uncertainty of machine and load.
@@ -73,7 +73,7 @@ class Contact:
     run: str
     time: np.ndarray
     probability: np.ndarray
-    load_change: np.ndarray
+    load_probability: np.ndarray
     task: tuple[str, ...]
     force: np.ndarray
     force_std: np.ndarray
@@ -87,8 +87,8 @@ class Contact:
 
     @property
     def is_loaded(self) -> np.ndarray:
-        """Whether the tool is free, and its load changes or is significantly larger than the smallest load (b,)."""
-        return ~self.is_contact & ((self.load > _SIGNIFICANT_STD * self.load_std) | (self.load_change > 0.5))
+        """Whether the tool is free, and a load is more probable than none (b,)."""
+        return ~self.is_contact & (self.load_probability > 0.5)
 
     def find_intervals(self, marked: np.ndarray) -> list[tuple[float, float]]:
         """Return start and end [s] of the intervals of marked blocks (b,)."""
@@ -191,10 +191,11 @@ def _detect_in_run(forces: ExternalForces, machine: Machine, run: str) -> Contac
     task, probability = _TASKS[: forces.jacobian.shape[1]], states[:, _CONTACT]
     mean, spread, error, doubt = _smooth_states(forces, observed, load, unit * sizes[-1] ** 2, states)
     force, force_std = _tip_force(forces, error, forces.covariance + doubt, sizes[-1])
-    mass, mass_std = (load_std * v for v in _load_mass(mean, spread, load))
-    least = int(np.argmin(mass))
+    mass, mass_std = (load_std * v for v in _load_mass(mean, spread, slice(-forces.load_effect.shape[2], None)))
+    least = int(np.argmin(mass + mass_std))  # a block whose load is known and small
     mass, mass_std = mass - mass[least], np.hypot(mass_std, mass_std[least])
-    return Contact(run, forces.time, probability, states[:, _LOAD_CHANGES], task, force, force_std, mass, mass_std)
+    loaded = np.maximum(states[:, _LOAD_CHANGES], _load_probability(mass, mass_std, load_std))
+    return Contact(run, forces.time, probability, loaded, task, force, force_std, mass, mass_std)
 
 
 def _observation_matrix(forces: ExternalForces, load_std: float) -> tuple[np.ndarray, slice]:
@@ -216,6 +217,17 @@ def _load_mass(mean: np.ndarray, spread: np.ndarray, load: slice) -> tuple[np.nd
     """Return mass and standard deviation (...,) of the load, relative to the prior standard deviation of its mass."""
     variance = spread[..., load, load].sum(axis=(-2, -1))
     return mean[..., load].sum(axis=-1), np.sqrt(np.maximum(variance, 1e-12))
+
+
+def _load_probability(mass: np.ndarray, mass_std: np.ndarray, load_std: float) -> np.ndarray:
+    """Return the probability (b,) of a load, given the estimate (b,) of its mass and its standard deviation [kg].
+
+    A load and no load are equally probable before. A load has a half-normal prior of standard deviation `load_std`.
+    """
+    total = np.hypot(mass_std, load_std)
+    positive = log_ndtr(mass * load_std / (mass_std * total)) - log_ndtr(0.0)
+    ratio = np.log(mass_std / total) + 0.5 * (mass / mass_std) ** 2 * (load_std / total) ** 2 + positive
+    return expit(ratio)
 
 
 def _unit_force_covariance(forces: ExternalForces, machine: Machine) -> np.ndarray:
@@ -335,6 +347,8 @@ def _collapse(x: np.ndarray, p: np.ndarray, weight: np.ndarray) -> tuple[np.ndar
 def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarray, states: np.ndarray):
     """Estimate parameter errors and load by a Kalman filter and RTS smoother, given the states of the tool.
 
+    The load is the sum of that at the start of the run and its change since then.
+
     Args:
         forces: external forces.
         observed: (b, n, k) effect of parameter errors and load.
@@ -343,9 +357,12 @@ def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarr
         states: (b, 3 + h) probabilities of the states.
 
     Returns:
-        Means (b, k) and covariances (b, k, k); external forces (b, n) without the effect of both, and
-        the covariance (b, n, n) of this effect.
+        Means (b, k + l) and covariances (b, k + l, k + l) of parameter errors, load at the start and change of
+        the load; external forces (b, n) without their effect, and the covariance (b, n, n) of this effect.
     """
+    start = observed.shape[2]
+    observed = np.concatenate([observed, observed[:, :, load]], axis=2)
+    load = slice(start, observed.shape[2])
     b, _, k = observed.shape
     walk = np.zeros((b, k))
     changes = states[:, _LOAD_CHANGES] + states[:, _CONTACT]
@@ -354,7 +371,7 @@ def _smooth_states(forces: ExternalForces, observed, load: slice, wide: np.ndarr
     noise = forces.covariance + other[:, None, None] * wide
     mean, spread = np.zeros((b, k)), np.zeros((b, k, k))
     ahead, ahead_spread = np.zeros((b, k)), np.zeros((b, k, k))
-    x, p = np.zeros(k), np.eye(k)
+    x, p = np.zeros(k), np.diag(1.0 * (np.arange(k) < start))
     for t in range(b):
         p = p + np.diag(walk[t])
         ahead[t], ahead_spread[t] = x, p

@@ -93,6 +93,7 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
     "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
     "contact_force": ChannelKind(("N",), "contact force of ground and objects on the machine, world frame", "xyz"),
+    "load": ChannelKind(("kg",), "mass of the soil in the bucket", "none"),
     "object_contact": ChannelKind(("N",), "contact force of a plate, tree, stump or log on the machine"),
     "tip": ChannelKind(("m",), "position of the arm's tip, world frame", "xyz"),
 }

@@ -34,7 +34,8 @@ from hydrotele.soil.parameters import SOILS
 
 SENSORS = "khoshzaban1992"
 FRICTION = ("stick", 6.0e3)  # axis and additional Coulomb friction [N] of the hidden effect
-LIGHT_CONTACT = 1.0e3  # N: contact with a smaller force is also reported separately
+LIGHT_CONTACT = 1.0e3  # [N] contact with a larger force is also reported separately
+LIGHT_LOAD = 100.0  # [kg] a smaller load does not count as a load
 
 
 def digging_scenario(rng: np.random.Generator, machine: str, name: str) -> Scenario:
@@ -84,15 +85,21 @@ def simulate(seed: int, machine: Machine, name: str) -> tuple[Log, Log]:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """Seconds of a log: contact, contact above 1 kN and free; how much of each is detected as contact, or as loaded."""
+    """Seconds of a log: contact, contact above 1 kN, free, free with and without soil in the bucket.
+
+    `*_found` is how much of it is detected: as contact, or (`loaded_found`, `empty_found`) as a load.
+    """
 
     contact: float
-    contact_masked: float
+    contact_found: float
     heavy: float
-    heavy_masked: float
+    heavy_found: float
     free: float
-    free_masked: float
-    free_loaded: float
+    free_found: float
+    loaded: float
+    loaded_found: float
+    empty: float
+    empty_found: float
 
     def __add__(self, other: "Score") -> "Score":
         """Return the sums over two logs."""
@@ -100,10 +107,11 @@ class Score:
 
     def row(self, name: str) -> str:
         """Return a row of the table."""
-        shares = (100 * self.contact_masked / self.contact, 100 * self.heavy_masked / self.heavy,
-                  100 * self.free_masked / self.free, 100 * self.free_loaded / self.free)  # fmt: skip
-        contact, heavy, free, loaded = (f"{share:.1f}" for share in shares)
-        return f"| {name} | {self.contact:.1f} | {contact} | {heavy} | {self.free:.1f} | {free} | {loaded} |"
+        values = dataclasses.astuple(self)
+        shares = [f"{100 * found / whole:.1f}" for whole, found in zip(values[::2], values[1::2], strict=True)]
+        contact, heavy, free, loaded, empty = shares
+        return (f"| {name} | {self.contact:.1f} | {contact} | {heavy} | {self.free:.1f} | {free}"
+                f" | {self.loaded:.1f} | {loaded} | {empty} |")  # fmt: skip
 
 
 def score(found: Contact, truth: Log) -> Score:
@@ -113,9 +121,10 @@ def score(found: Contact, truth: Log) -> Score:
     loaded = ~find_unmasked_rows(
         [MaskedInterval("", *i) for i in found.find_intervals(found.is_loaded)], "", truth.time
     )
-    parts = force > 0.0, force > LIGHT_CONTACT, force == 0.0
-    sums = [float(v) / truth.rate for p in parts for v in (p.sum(), (p & masked).sum())]
-    return Score(*sums[:6], free_loaded=float((parts[2] & loaded & ~masked).sum()) / truth.rate)
+    free, full = force == 0.0, truth["truth.load"] > LIGHT_LOAD
+    parts = [(force > 0.0, masked), (force > LIGHT_CONTACT, masked), (free, masked),
+             (free & full, loaded | masked), (free & (truth["truth.load"] == 0.0), loaded)]  # fmt: skip
+    return Score(*(float(rows.sum()) / truth.rate for part, found in parts for rows in (part, part & found)))
 
 
 def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> list[str]:
@@ -150,8 +159,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--friction", type=int, help="seed of a gap run with a hidden friction")
     chosen = parser.parse_args(arguments)
     nominal, total, rows = load_machine("cat215", "bucket"), None, []
-    print("| seed | contact [s] | masked [%] | masked above 1 kN [%] | free [s] | masked [%] | loaded [%] |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    print("| seed | contact [s] | found [%] | found above 1 kN [%] | free [s] | found as contact [%]"
+          " | with load [s] | found [%] | without load, found as load [%] |")  # fmt: skip
+    print("| --- " + "| ---: " * 8 + "|")
     for seed in chosen.seeds:
         log, truth = simulate(seed, draw_machine(seed, nominal), f"dig_{seed}")
         (found,) = detect_contact([RunFiles(f"dig_{seed}", (log,))], nominal)
