@@ -11,6 +11,7 @@ import numpy as np
 from hydrotele.cli.console import make_table, print_json, print_notes, stdout_console, write_json
 from hydrotele.cli.input_logs import open_logs
 from hydrotele.control.contact import Contact, contact_masks, detect_contact
+from hydrotele.control.log_forces import BLOCK_SECONDS
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.dataset import Dataset, make_dataset
@@ -56,7 +57,12 @@ def load_dataset_without_contact(
     masks = contact_masks(found, files)
     if not masks:
         return whole
-    dataset = make_dataset(files, machine, sensors, heldout, (*given, *masks))
+    try:
+        dataset = make_dataset(files, machine, sensors, heldout, (*given, *masks))
+    except InputError as error:
+        seconds = sum(mask.end - mask.begin for mask in masks)
+        message = f"{error}. Contact or a load is detected in {seconds:.1f} s: log free motion, or use --contact ignore"
+        raise InputError("data without contact", message) from None
     notes = tuple(
         f"{name}: contact is detected in {row['contact_s']:.1f} s and a load on the tool in {row['loaded_s']:.1f} s"
         f" of {row['duration_s']:.1f} s; these intervals are masked (--contact ignore uses them)."
@@ -70,10 +76,9 @@ def summarise_contact(found: Sequence[Contact]) -> dict[str, dict[str, float]]:
     rows: dict[str, dict[str, float]] = {}
     for one in found:
         row = rows.setdefault(one.run, {"duration_s": 0.0, "contact_s": 0.0, "loaded_s": 0.0, "max_tip_force_n": 0.0})
-        step = float(np.median(np.diff(one.time))) if len(one.time) > 1 else 0.0
-        row["duration_s"] += step * len(one.time)
-        row["contact_s"] += step * float(one.is_contact.sum())
-        row["loaded_s"] += step * float(one.is_loaded.sum())
+        row["duration_s"] += float(one.time[-1] - one.time[0]) + BLOCK_SECONDS
+        row["contact_s"] += sum(end - begin for begin, end in one.find_intervals(one.is_contact))
+        row["loaded_s"] += sum(end - begin for begin, end in one.find_intervals(one.is_loaded))
         size = np.hypot(*(one.force[one.is_contact, one.task.index(k)] for k in ("r", "z")))
         row["max_tip_force_n"] = max(row["max_tip_force_n"], float(size.max(initial=0.0)))
     return rows

@@ -78,7 +78,9 @@ Black-box models, fitted on the other runs (--baseline, repeatable):
 
 ContactChoice = Annotated[
     Literal["mask", "ignore"],
-    typer.Option("--contact", help="Mask intervals in which pressures show contact or a load of the tool, or use them."),
+    typer.Option(
+        "--contact", help="Mask intervals in which pressures show contact or a load of the tool, or use them."
+    ),
 ]
 
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit, log_ndtr
 
-from hydrotele.control.log_forces import BLOCK_SECONDS, ExternalForces, compute_external_forces
+from hydrotele.control.log_forces import BLOCK_SECONDS, FILTER_SECONDS, ExternalForces, compute_external_forces
 from hydrotele.control.tip_balance import arm_joints
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
@@ -91,11 +91,14 @@ class Contact:
         return ~self.is_contact & (self.load_probability > 0.5)
 
     def find_intervals(self, marked: np.ndarray) -> list[tuple[float, float]]:
-        """Return start and end [s] of the intervals of marked blocks (b,)."""
+        """Return start and end [s] of the intervals of marked blocks (b,).
+
+        The first and the last block extend over the first and last rows of the run, which have no block.
+        """
         edges = np.flatnonzero(np.diff(marked, prepend=False, append=False))
-        half = 0.5 * BLOCK_SECONDS
-        return [(float(self.time[a]) - half, float(self.time[b - 1]) + half)
-                for a, b in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
+        begin, end = self.time - 0.5 * BLOCK_SECONDS, self.time + 0.5 * BLOCK_SECONDS
+        begin[0], end[-1] = begin[0] - 0.5 * FILTER_SECONDS, end[-1] + 0.5 * FILTER_SECONDS
+        return [(float(begin[a]), float(end[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def detect_contact(
@@ -151,9 +154,7 @@ def _check_pressures(files: Sequence[RunFiles], machine: Machine) -> None:
         missing = [channel for axis in machine.hydraulic_axes for side in ("head", "rod")
                    if not any((channel := f"pressure_{side}.{axis}") in log for log in run.logs)]  # fmt: skip
         if missing:
-            message = (
-                f"run {run.name} has no {', '.join(missing)}: log both pressures of every drive, or omit --contact"
-            )
+            message = f"run {run.name} has no {', '.join(missing)}: log both pressures of every drive"
             raise InputError(where, message)
 
 

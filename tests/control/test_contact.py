@@ -24,8 +24,11 @@ def digging():
     return load_machine("cat215", "bucket"), RunFiles("dig", (run.measured,)), run.truth
 
 
-def forces_of(load: np.ndarray, force: np.ndarray) -> ExternalForces:
-    """Return external forces on a moving arm with a load [kg] and a tip force (b, 2) [N], one parameter error."""
+def forces_of(load: np.ndarray, force: np.ndarray, stick: np.ndarray | float = 0.0) -> ExternalForces:
+    """Return external forces on a moving arm with a load [kg] and a tip force (b, 2) [N], one parameter error.
+
+    `stick` (b,) is an unmodelled torque of the stick's drive [N m].
+    """
     rng, b = np.random.default_rng(3), len(load)
     phase = 0.05 * np.arange(b)
     jacobian = np.zeros((b, 4, 4))
@@ -39,9 +42,10 @@ def forces_of(load: np.ndarray, force: np.ndarray) -> ExternalForces:
     tip[:, [0, 2]] = force
     value = np.einsum("bmi,bm->bi", jacobian, tip) + error - 9.81 * load[:, None] * places[:, :, 2]
     value += std * rng.normal(size=(b, 4))
+    value[:, 2] += stick
     return ExternalForces(
         0.1 * np.arange(b), value, np.tile(np.diag(std**2), (b, 1, 1)), error[:, :, None], -9.81 * places,
-        np.zeros((b, 4)), jacobian, np.full(b, 6.0),
+        np.zeros((b, 4)), np.tile(np.eye(4), (b, 1, 1)), jacobian, np.full(b, 6.0),
     )  # fmt: skip
 
 
@@ -65,6 +69,13 @@ def test_upward_force_at_rest_is_contact_because_no_load_has_negative_mass():
     still = forces_of(np.zeros(120), force)
     found = _detect_in_run(still, load_machine("cat215", "bucket"), "run")
     assert found.is_contact[62:].all() and not found.is_contact[:58].any()
+
+
+def test_unmodelled_force_of_one_drive_is_not_contact():
+    stick = np.zeros(120)
+    stick[50:80] = 12e3 * np.sin(0.4 * np.arange(30))
+    found = _detect_in_run(forces_of(np.zeros(120), np.zeros((120, 2)), stick), load_machine("cat215", "bucket"), "run")
+    assert not found.is_contact.any() and not found.is_loaded.any()
 
 
 def test_bucket_in_soil_is_found_with_its_force():
