@@ -34,12 +34,15 @@ from hydrotele.soil.parameters import SOILS
 
 SENSORS = "khoshzaban1992"
 FRICTION = ("stick", 6.0e3)  # axis and additional Coulomb friction [N] of the hidden effect
+FREE_MOTION = (8, 4.0)  # number and duration [s] of the moves of these logs
 LIGHT_CONTACT = 1.0e3  # [N] contact with a larger force is also reported separately
 LIGHT_LOAD = 100.0  # [kg] a smaller load does not count as a load
 
 
-def digging_scenario(rng: np.random.Generator, machine: str, name: str) -> Scenario:
-    """Return a scenario with about as much contact as free motion."""
+def digging_scenario(
+    rng: np.random.Generator, machine: str, name: str, moves: int = 3, seconds: float = 2.5
+) -> Scenario:
+    """Return a scenario with a number of free moves of about `seconds` each, and two digging cycles."""
     points, r, z = [], rng.uniform(6.6, 7.4), 0.9
 
     def move(duration: float, r: float, z: float, attitude: float, pause: float = 0.0) -> None:
@@ -47,8 +50,8 @@ def digging_scenario(rng: np.random.Generator, machine: str, name: str) -> Scena
                 "theta": float(rng.uniform(-0.02, 0.02))}  # fmt: skip
         points.append({"duration": float(duration * rng.uniform(0.85, 1.2)), "pause": pause, "pose": pose})
 
-    for _ in range(3):
-        move(2.5, rng.uniform(5.0, 6.0), rng.uniform(0.9, 2.0), rng.uniform(-150, -80))
+    for _ in range(moves):
+        move(seconds, rng.uniform(5.0, 6.0), rng.uniform(0.9, 2.0), rng.uniform(-150, -80))
     for _ in range(2):
         depth, reach = rng.uniform(0.15, 0.4), rng.uniform(6.6, 7.1)
         move(2.5, reach, 0.5, -68)
@@ -75,11 +78,11 @@ def draw_machine(seed: int, nominal: Machine) -> Machine:
     return uncertain.machine(nominal, np.clip(np.random.default_rng(seed).normal(size=uncertain.size), -2.0, 2.0))
 
 
-def simulate(seed: int, machine: Machine, name: str) -> tuple[Log, Log]:
-    """Return the measured and the true log of a digging run."""
+def simulate(seed: int, machine: Machine, name: str, *free_motion: float) -> tuple[Log, Log]:
+    """Return the measured and the true log of a digging run, with other `free_motion` (moves, seconds)."""
     with tempfile.TemporaryDirectory() as folder:
         save_machine(machine, Path(folder) / "machine.yaml")
-        run = run_scenario(digging_scenario(np.random.default_rng([seed, 1]), folder, name))
+        run = run_scenario(digging_scenario(np.random.default_rng([seed, 1]), folder, name, *free_motion))
     return run.measured, run.truth
 
 
@@ -127,27 +130,21 @@ def score(found: Contact, truth: Log) -> Score:
     return Score(*(float(rows.sum()) / truth.rate for part, found in parts for rows in (part, part & found)))
 
 
-def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> list[str]:
-    """Return lines on `gap` with a hidden friction in three digging logs, with and without the mask."""
+def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
+    """Print what `gap` finds in three half digging logs of a machine with a hidden friction, with and without the mask."""
     axis, more = FRICTION
-
-    def rub(machine: Machine) -> Machine:
-        friction = machine.axes[axis].drive.friction.coulomb
-        return machine.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
-
-    drawn = draw_machine(seed, nominal)
-    logs = [simulate(seed + 100 * k, rub(drawn), f"dig_{k}")[0] for k in range(3)]
+    friction = nominal.axes[axis].drive.friction.coulomb
+    hidden = nominal.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
+    logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", *FREE_MOTION)[0] for k in range(3)]
     files = [RunFiles(f"dig_{k}", (dataclasses.replace(log, source=f"dig_{k}"),)) for k, log in enumerate(logs)]
     if keep:
         for k, log in enumerate(logs):
             save_log(log, keep / f"friction_{k}.parquet")
-    found, out = detect_contact(files, nominal), []
-    for name, masks in (("masked", contact_masks(found, files)), ("not masked", ())):
+    found = detect_contact(files, nominal)
+    for name, masks in (("mask", contact_masks(found, files)), ("ignore", ())):
         gap = find_gap(make_dataset(files, nominal, masks=masks))
-        named = ", ".join(f"{e.name} at {e.location}" for e in gap.effects) or "none"
-        out.append(f"| {name} | {gap.verdict} | {named} |")
-        print(out[-1], flush=True)
-    return out
+        named = ", ".join(f"{e.name} at {e.location} ({e.probability:.2f})" for e in gap.effects) or "none"
+        print(f"| {name} | {gap.verdict} | {named} |", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
