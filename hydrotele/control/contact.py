@@ -65,7 +65,7 @@ class Contact:
         task: names of the m task coordinates of the force.
         force: (b, m) force of the environment on the tip [N] or [N m].
         force_std: (b, m) its standard deviation, with the uncertainty of machine and load.
-        load: (b,) mass of the load on the tool, less the smallest load of the run [kg]. A constant load cannot be
+        load: (b,) mass of the load on the tool, less the smallest mean of the run over 3 s [kg]. A constant load cannot be
             distinguished from errors of the machine's masses.
         load_std: (b,) its standard deviation [kg].
     """
@@ -193,8 +193,10 @@ def _detect_in_run(forces: ExternalForces, machine: Machine, run: str) -> Contac
     mean, spread, error, doubt = _smooth_states(forces, observed, load, unit * sizes[-1] ** 2, states)
     force, force_std = _tip_force(forces, error, forces.covariance + doubt, sizes[-1])
     mass, mass_std = (load_std * v for v in _load_mass(mean, spread, slice(-forces.load_effect.shape[2], None)))
-    least = int(np.argmin(mass + mass_std))  # a block whose load is known and small
-    mass, mass_std = mass - mass[least], np.hypot(mass_std, mass_std[least])
+    count = min(round(_MEAN_INTERVAL_S / BLOCK_SECONDS), len(mass))
+    means = np.convolve(mass, np.full(count, 1.0 / count), "valid")
+    least = int(np.argmin(means))
+    mass, mass_std = mass - means[least], np.hypot(mass_std, mass_std[least + count // 2])
     loaded = np.maximum(states[:, _LOAD_CHANGES], _load_probability(mass, mass_std, load_std))
     return Contact(run, forces.time, probability, loaded, task, force, force_std, mass, mass_std)
 
