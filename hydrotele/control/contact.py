@@ -65,8 +65,8 @@ class Contact:
         task: names of the m task coordinates of the force.
         force: (b, m) force of the environment on the tip [N] or [N m].
         force_std: (b, m) its standard deviation, with the uncertainty of machine and load.
-        load: (b,) mass of the load on the tool, less the smallest mean of the run over 3 s [kg]. A constant load cannot be
-            distinguished from errors of the machine's masses.
+        load: (b,) mass of the load on the tool, less the smallest mean of the run over 3 s [kg]. A constant
+            load cannot be distinguished from errors of the machine's masses.
         load_std: (b,) its standard deviation [kg].
     """
 

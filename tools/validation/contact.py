@@ -131,7 +131,7 @@ def score(found: Contact, truth: Log) -> Score:
 
 
 def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
-    """Print what `gap` finds in three half digging logs of a machine with a hidden friction, with and without the mask."""
+    """Print what `gap` finds in digging logs of a machine with a hidden friction, with and without the mask."""
     axis, more = FRICTION
     friction = nominal.axes[axis].drive.friction.coulomb
     hidden = nominal.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
