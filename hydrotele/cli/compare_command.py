@@ -23,6 +23,7 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
+from hydrotele.cli.contact_command import ContactOption, load_dataset_without_contact
 from hydrotele.cli.input_logs import find_corrected_machine_folder, load_machine_for_logs
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
@@ -41,7 +42,7 @@ from hydrotele.estimate.reduced_model import predicted_channels
 from hydrotele.gap.bands import BandSummary, RunBands, band_document, compute_run_bands, noise_of, sample_machines
 from hydrotele.gap.posterior import POSTERIOR_FILE, Posterior, read_posterior
 from hydrotele.hydraulics.actuator_layout import actuator_order
-from hydrotele.logs.dataset import Dataset, RunData, load_dataset
+from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.log_channels import default_channel_unit
 from hydrotele.machine.machine import Machine
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
@@ -112,6 +113,7 @@ def compare_models(
     machines: Sequence[str], data: Sequence[Path], tool: str | None, heldout: str | None,
     sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], include_fitted: bool,
     target: Path | None, as_json: bool, force: bool = False, bands: int | None = None,
+    contact: ContactOption = "mask",
 ) -> dict[str, Any]:  # fmt: skip
     """Compare open-loop predictions of several models on runs that were not used to fit them.
 
@@ -130,6 +132,7 @@ def compare_models(
         force: accept logs whose metadata name another machine or tool.
         bands: number of machines sampled from the posterior of each result folder of `gap`, for prediction
             bands; 0 for none, None for 20 where a folder has a posterior.
+        contact: `mask` to mask intervals of detected contact and loads, `ignore` to use all rows.
 
     Returns:
         The result in the form of `compare.json`.
@@ -144,9 +147,7 @@ def compare_models(
         check_output_folder(target, "compare")
     stop_profiling_clock()
     named = {name: load_machine_for_logs(data, find_corrected_machine_folder(name), tool) for name in machines}
-    dataset = load_dataset(
-        list(data), next(iter(named.values())), sensors, heldout, force=force
-    )  # fmt: skip
+    dataset = load_dataset_without_contact(data, next(iter(named.values())), sensors, heldout, force, contact)
     for name, machine in named.items():
         _check_same_channels(name, machine, dataset)
     posteriors = _read_posteriors(machines, bands)

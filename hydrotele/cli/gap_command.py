@@ -25,6 +25,7 @@ from hydrotele.cli.console import (
     stdout_console,
     write_json,
 )
+from hydrotele.cli.contact_command import ContactOption, load_dataset_without_contact
 from hydrotele.cli.input_logs import derive_data_name, load_machine_for_logs
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
@@ -38,7 +39,7 @@ from hydrotele.gap.posterior import write_posterior
 from hydrotele.gap.result import Gap, Method, finite, gap_document, in_customary_units
 from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
-from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.open_loop_prediction import open_loop_errors
@@ -54,7 +55,7 @@ def gap_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, recording: bool,
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
-    mask: Path | None = None, method: Method = "search",
+    mask: Path | None = None, method: Method = "search", contact: ContactOption = "mask",
 ) -> Path:  # fmt: skip
     """Find the effects that explain the differences (gap) between a machine model and its logs.
 
@@ -75,6 +76,7 @@ def gap_to_folder(
         force: accept logs whose metadata name another machine or tool.
         mask: CSV file of masked intervals, which are not used.
         method: how effects are searched, `search` or `regression`.
+        contact: `mask` to mask intervals of detected contact and loads, `ignore` to use all rows.
 
     Returns:
         The output folder.
@@ -89,7 +91,7 @@ def gap_to_folder(
     check_output_folder(target, "gap")
     stop_profiling_clock()
     model = load_machine_for_logs(data, machine, tool)
-    dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
+    dataset = load_dataset_without_contact(data, model, sensors, heldout, force, contact, mask)
     with keep_interim_answer(target) as keep:
         gap = _run_search(dataset, effects, jobs, method, as_json, keep)
         with atomic_folder(target, "gap") as folder:

@@ -25,6 +25,7 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
+from hydrotele.cli.contact_command import ContactOption, load_dataset_without_contact
 from hydrotele.cli.input_logs import derive_data_name, load_machine_for_logs
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
@@ -46,7 +47,7 @@ from hydrotele.identify.result import (
     count_statuses,
     parameter_rows,
 )
-from hydrotele.logs.dataset import Dataset, load_dataset
+from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
     MACHINE_FILE,
@@ -101,7 +102,7 @@ class IdentificationOptions:
 def identify_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, choices: IdentificationOptions,
-    force: bool = False,
+    force: bool = False, contact: ContactOption = "mask",
 ) -> Path:  # fmt: skip
     """Identify masses, friction and, if requested, hydraulics of a machine from logs.
 
@@ -117,6 +118,7 @@ def identify_to_folder(
         as_json: print `identify.json` instead of text.
         choices: options of the identification.
         force: accept logs whose metadata name another machine or tool.
+        contact: `mask` to mask intervals of detected contact and loads, `ignore` to use all rows.
 
     Returns:
         The output folder.
@@ -129,7 +131,7 @@ def identify_to_folder(
     check_output_folder(target, "identify")
     stop_profiling_clock()
     model = load_machine_for_logs(data, machine, tool)
-    dataset = load_dataset(list(data), model, sensors, heldout, force=force)
+    dataset = load_dataset_without_contact(data, model, sensors, heldout, force, contact)
     with show_stages(f"identify {model.name}", as_json) as progress:
         say = progress or (lambda said, share: None)
         say("mechanism", 0.0)

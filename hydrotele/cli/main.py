@@ -76,6 +76,14 @@ Black-box models, fitted on the other runs (--baseline, repeatable):
 """
 
 
+ContactChoice = Annotated[
+    Literal["mask", "ignore"],
+    typer.Option(
+        "--contact", help="Mask intervals in which pressures show contact or a load of the tool, or use them."
+    ),
+]
+
+
 def compare(
     machine: Annotated[
         list[str],
@@ -103,6 +111,7 @@ def compare(
         ),
     ] = None,
     effects: EffectFilesOption = None,
+    contact: ContactChoice = "mask",
     force: Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
@@ -111,7 +120,7 @@ def compare(
 
     compare_models(
         machine, data, tool, heldout, sensors, parse_positive_numbers("--horizons", horizons), baseline or [],
-        every, out, json, force, bands,
+        every, out, json, force, bands, contact,
     )  # fmt: skip
 
 
@@ -343,6 +352,7 @@ def gap(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
     mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
+    contact: ContactChoice = "mask",
     force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     method: Annotated[
@@ -362,7 +372,7 @@ def gap(
     model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
-                       "--force": force}  # fmt: skip
+                       "--force": force, "--contact": contact != "mask"}  # fmt: skip
         if strange := [option for option, value in of_machines.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
@@ -370,7 +380,7 @@ def gap(
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
-        effect or [], jobs, force, mask, method,
+        effect or [], jobs, force, mask, method, contact,
     )  # fmt: skip
 
 
@@ -418,6 +428,7 @@ def identify(
     truncate: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Discard singular values below this fraction of the largest.")
     ] = 0.0,
+    contact: ContactChoice = "mask",
     force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -447,6 +458,7 @@ def identify(
         given = {
             "--machine": machine, "--tool": tool, "--sensors": sensors, "--reduced": reduced,
             "--pins": pins, "--asymmetry": asymmetry, "--hydraulics": hydraulics,
+            "--contact": contact != "mask",
         }  # fmt: skip
         if strange := [option for option, value in given.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it with --mjcf")
@@ -457,7 +469,30 @@ def identify(
         return
     if columns is not None:
         raise InputError("--columns", "is used only together with --mjcf: give both")
-    identify_to_folder([*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force)
+    identify_to_folder([*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force, contact)
+
+
+@app.command(
+    epilog="Examples:  hydrotele contact --machine cat215 --data logs --out contact_logs   |   "
+    "hydrotele review contact_logs/dig_1.parquet --plot dig_1.png"
+)
+def contact(
+    data: LogsOption,
+    more: MoreLogsArgument = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    sensors: SensorsOption = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the masked intervals and logs with the tip force.")
+    ] = None,
+    force: ForceOption = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Find intervals in which the tool touches the ground or carries a load, from cylinder pressures."""
+    from hydrotele.cli.contact_command import report_contact
+
+    report_contact([*data, *(more or [])], machine, tool, sensors, out, json, force)
 
 
 @app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")

@@ -27,6 +27,7 @@ COMMAND_GROUPS = {
         "replay": "Simulate the model with the commands of a log; print the prediction errors.",
         "compare": "Compare open-loop predictions of several models with logs: RMS error per channel.",
         "gap": "Find differences between model and logs, identify their cause, correct the model.",
+        "contact": "Find intervals in which the tool touches the ground or carries a load, from cylinder pressures.",
         "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
     },
     "Identify and calibrate": {

@@ -28,6 +28,7 @@ OUTPUT_FILES = {
     ),
     "interim gap": ("interim.json", "machine.*", "machine_assets/*"),
     "compare": ("compare.json", "*.png"),
+    "contact": ("contact.json", "mask.csv", "*.parquet"),
     "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",
                           "calibrated.urdf"),
     "arm calibration": ("calibration.json", "report.html", "machine.yaml"),

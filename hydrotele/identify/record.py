@@ -37,6 +37,7 @@ class IdentificationRecord:
             oil, or of a force drive's command.
         force_noise: (k,) standard deviation of one force; 0 if it follows from a command, NaN if
             the sensors state none.
+        first_row: index of the first row in the run; earlier rows have no position.
     """
 
     name: str
@@ -46,6 +47,7 @@ class IdentificationRecord:
     position_noise: np.ndarray
     force: np.ndarray
     force_noise: np.ndarray
+    first_row: int = 0
 
 
 def build_records(
@@ -229,7 +231,8 @@ def trim_missing_positions(record: IdentificationRecord) -> IdentificationRecord
             raise InputError(record.name, f"has no valid position of {axis}: remove this run")
     first = int(known.argmax(axis=0).max())
     last = len(known) - int(known[::-1].argmax(axis=0).max())
-    return replace(record, position=record.position[first:last], force=record.force[first:last])
+    rows = slice(first, last)
+    return replace(record, position=record.position[rows], force=record.force[rows], first_row=record.first_row + first)
 
 
 def _position_channels(dataset: Dataset, axis: str) -> list[str]:

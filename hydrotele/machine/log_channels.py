@@ -56,6 +56,10 @@ MEASURED_KINDS: Mapping[str, ChannelKind] = {
     "handle_stiffness": ChannelKind(("N/m", "N m/rad"), "stiffness of the joystick's axis"),
     "coil_current": ChannelKind(("A",), "current of a coil of the joystick"),
     "tip_force": ChannelKind(("N", "N m"), "estimated force of the environment on the tip"),
+    "tip_force_std": ChannelKind(("N", "N m"), "standard deviation of the estimated tip force"),
+    "contact": ChannelKind(("1",), "probability of contact between tool and environment", "none"),
+    "load": ChannelKind(("kg",), "estimated mass of the load on the tool", "none"),
+    "load_std": ChannelKind(("kg",), "standard deviation of the estimated load", "none"),
     "tip_pose": ChannelKind(("m", "rad"), "pose of the tip from the measured joints"),
     "tip_reference": ChannelKind(("m", "rad"), "reference pose of the tip"),
     "angle": ChannelKind(("rad",), "joint angle, not wrapped"),
@@ -101,6 +105,7 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
     "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
     "contact_force": ChannelKind(("N",), "contact force of ground and objects on the machine, world frame", "xyz"),
+    "load": ChannelKind(("kg",), "mass of the soil in the bucket", "none"),
     "object_contact": ChannelKind(("N",), "contact force of a plate, tree, stump or log on the machine"),
     "tip": ChannelKind(("m",), "position of the arm's tip, world frame", "xyz"),
 }

@@ -237,6 +237,7 @@ def _simulate_commands(plant: Plant, data, times, commands, steps, progress) -> 
         if progress and row % 100 == 0:
             progress(time - times[0], times[-1] - times[0])
         recorder.contact[row, 0] += around.soil_force
+        recorder.load[row] = around.soil_load
         stepper.advance(commands[row])
         if around.needs_update:
             around.update(time, data, period)

@@ -212,6 +212,7 @@ class Session:
             row, left = divmod(first, self.ticks_per_row)
             if not left and row < len(self._recorder.contact):
                 self._recorder.contact[row, 0] += self._around.soil_force
+                self._recorder.load[row] = self._around.soil_load
             self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:

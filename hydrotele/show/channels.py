@@ -61,6 +61,10 @@ TITLES: Mapping[str, str] = {
     "tip_reference": "reference pose of the tip",
     "tip_pose": "measured pose of the tip",
     "tip_force": "measured force at the tip",
+    "tip_force_std": "standard deviation of the force at the tip",
+    "contact": "probability of contact",
+    "load": "load on the tool",
+    "load_std": "standard deviation of the load on the tool",
 }
 # Kinds shown in m and N: tip positions are large, hand forces are small.
 _UNSCALED_KINDS = ("tip", "tip_pose", "tip_reference", "hand_force", "handle_force")

@@ -44,6 +44,7 @@ class Record:
         act: (n, na) activations.
         command: (n, nu) mean command over the interval of the row, each in its drive's unit.
         contact: (n, 3) total contact force of ground and objects on the machine, world frame [N].
+        load: (n,) mass of the soil in the bucket [kg].
         contact_of: name of each surrounding object -> (n, 3) its force on the machine [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
         delayed_readings: (n, c) values of `sensed_channels` after delay and lag of the sensors,
@@ -57,6 +58,7 @@ class Record:
     act: np.ndarray
     command: np.ndarray
     contact: np.ndarray
+    load: np.ndarray
     contact_of: dict[str, np.ndarray]
     tip: np.ndarray
     delayed_readings: np.ndarray
@@ -222,6 +224,7 @@ class Recorder:
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
         self.command = np.zeros((rows, model.nu))
         self.contact = np.zeros((rows, len(self.group_names), 3))
+        self.load = np.zeros(rows)
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
         late = any(error.is_delayed for error in plant.machine.sensor_errors.values())
         self.late = np.zeros((rows, len(sensed_channels(plant)) if late else 0))
@@ -301,6 +304,6 @@ class Recorder:
         single = {name: contact[:, k] for k, name in enumerate(self.group_names) if k > 0}
         return Record(
             self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
-            self.act[:rows], self.command[:rows], contact.sum(axis=1), single, self.tip[:rows],
-            self.late[:rows],
+            self.act[:rows], self.command[:rows], contact.sum(axis=1), self.load[:rows], single,
+            self.tip[:rows], self.late[:rows],
         )  # fmt: skip

@@ -237,6 +237,11 @@ class Surroundings:
         """
         return sum((one.bed.force for one in self._beds), np.zeros(3))
 
+    @property
+    def soil_load(self) -> float:
+        """Mass of the soil in the bucket [kg]."""
+        return sum(one.bed.carried_mass for one in self._beds)
+
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
         """Update cutting of trees, gripping of objects and digging; call it once per control period.
 

@@ -156,6 +156,8 @@ def _unmeasured_channels(plant: Plant, record: Record):
         if np.any(force):
             for letter, column in zip("xyz", force.T, strict=True):
                 add_channel(f"truth.object_contact.{name}_{letter}", column, "N")
+    if np.any(record.load):
+        add_channel("truth.load", record.load, "kg")
     for k, letter in enumerate("xyz"):
         if np.any(record.contact):
             add_channel(f"truth.contact_force.{letter}", record.contact[:, k], "N")
