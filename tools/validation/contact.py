@@ -135,7 +135,7 @@ def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
     axis, more = FRICTION
     friction = nominal.axes[axis].drive.friction.coulomb
     hidden = nominal.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
-    logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", FREE_MOTION)[0] for k in range(3)]
+    logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", FREE_MOTION)[0] for k in range(2)]
     files = [RunFiles(f"dig_{k}", (dataclasses.replace(log, source=f"dig_{k}"),)) for k, log in enumerate(logs)]
     if keep:
         for k, log in enumerate(logs):
