@@ -78,8 +78,8 @@ def draw_machine(seed: int, nominal: Machine) -> Machine:
     return uncertain.machine(nominal, np.clip(np.random.default_rng(seed).normal(size=uncertain.size), -2.0, 2.0))
 
 
-def simulate(seed: int, machine: Machine, name: str, *free_motion: float) -> tuple[Log, Log]:
-    """Return the measured and the true log of a digging run, with other `free_motion` (moves, seconds)."""
+def simulate(seed: int, machine: Machine, name: str, free_motion: tuple[int, float] = (3, 2.5)) -> tuple[Log, Log]:
+    """Return the measured and the true log of a digging run, whose `free_motion` is (moves, seconds)."""
     with tempfile.TemporaryDirectory() as folder:
         save_machine(machine, Path(folder) / "machine.yaml")
         run = run_scenario(digging_scenario(np.random.default_rng([seed, 1]), folder, name, *free_motion))
@@ -135,7 +135,7 @@ def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
     axis, more = FRICTION
     friction = nominal.axes[axis].drive.friction.coulomb
     hidden = nominal.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
-    logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", *FREE_MOTION)[0] for k in range(3)]
+    logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", FREE_MOTION)[0] for k in range(2)]
     files = [RunFiles(f"dig_{k}", (dataclasses.replace(log, source=f"dig_{k}"),)) for k, log in enumerate(logs)]
     if keep:
         for k, log in enumerate(logs):
