@@ -59,10 +59,13 @@ def load_dataset_without_contact(
         return whole
     try:
         dataset = make_dataset(files, machine, sensors, heldout, (*given, *masks))
-    except InputError as error:
+    except InputError:
         seconds = sum(mask.end - mask.begin for mask in masks)
-        message = f"{error}. Contact or a load is detected in {seconds:.1f} s: log free motion, or use --contact ignore"
-        raise InputError("data without contact", message) from None
+        note = (
+            f"Contact or a load is detected in {seconds:.1f} s. Too little remains without them, so all rows are used."
+            " If the tool was free, the masses, areas or pressure sensors of the model are wrong."
+        )
+        return dataclasses.replace(whole, notes=(note, *whole.notes))
     notes = tuple(
         f"{name}: contact is detected in {row['contact_s']:.1f} s and a load on the tool in {row['loaded_s']:.1f} s"
         f" of {row['duration_s']:.1f} s; these intervals are masked (--contact ignore uses them)."

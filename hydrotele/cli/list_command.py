@@ -40,12 +40,12 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
     print("\n\n".join(format_items(kind, rows, stdout_console.width) for kind, rows in data.items()))
 
 
-_MAX_SUMMARY_LINES = 30  # a summary fits a terminal window
+_MAX_SUMMARY_LINES = 31  # a summary fits a terminal window
 _MIN_TEXT_WIDTH = 30  # characters next to the names; a narrower text starts below its name
 
 
 def format_name_lists(names: dict[str, list[str]], width: int) -> str:
-    """Format the names of all items of all kinds in at most 30 lines, without cutting a name.
+    """Format the names of all items of all kinds in at most 31 lines, without cutting a name.
 
     Args:
         names: kind of the items -> their names. If they need too many lines, the last names of the

@@ -35,6 +35,7 @@ from hydrotele.envs.episode import (
     RESOLVED_MOTION,
     SAME_STEP,
     VALVE,
+    arm_values,
     draw_uniform,
 )
 from hydrotele.envs.observation import write_machine_observation
@@ -110,21 +111,21 @@ def _integrate_pose_rates(f, e, action):
             goal = _clip_action(f, action, c) * f.fastest_pose[c]
         e.pose_rate[c] = _limit_change(e.pose_rate[c], goal, f.accelerations[c] * f.period)
         wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
-    far = False
-    for i in range(k):
-        far = far or abs(e.reference[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
-    held = far or step_references_to_pose(
-        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
-        e.reference_rate[:k],
-    )  # fmt: skip
+    far, ranges = False, np.empty((k, 2))
+    q, rates, joint = arm_values(f, e.reference), arm_values(f, e.reference_rate), arm_values(f, e.joint)
+    for a in range(k):
+        far = far or abs(q[a] - joint[a]) > _MAX_REFERENCE_LEAD
+        ranges[a, 0], ranges[a, 1] = f.ranges[f.driven_axis[a], 0], f.ranges[f.driven_axis[a], 1]
+    held = far or step_references_to_pose(f.arm, ranges, wanted, e.pose_rate, False, e.pose, q, rates)
     e.blocked = 1 if held else 0
     if held:
-        e.pose_rate[:] = 0.0
-        e.reference_rate[:k] = 0.0
+        e.pose_rate[:], rates[:] = 0.0, 0.0
     if far:  # the arm is blocked by an obstacle: continue from its measured position
-        for i in range(k):
-            e.reference[i] = _limit_change(e.joint[i], e.reference[i], _MAX_REFERENCE_LEAD)
-        compute_tip_pose(f.arm, e.reference[:k], e.pose)
+        for a in range(k):
+            q[a] = _limit_change(joint[a], q[a], _MAX_REFERENCE_LEAD)
+        compute_tip_pose(f.arm, q, e.pose)
+    for a in range(k):
+        e.reference[f.driven_axis[a]], e.reference_rate[f.driven_axis[a]] = q[a], rates[a]
 
 
 @compiled
@@ -295,7 +296,7 @@ def _begin_episode(f, e, w):
     for i in range(len(e.joint)):
         e.reference[i] = e.sampled_reference[i] = e.joint[i]
     if f.arm_axes > 0:
-        compute_tip_pose(f.arm, e.reference[: f.arm_axes], e.pose)
+        compute_tip_pose(f.arm, arm_values(f, e.reference), e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
     w.measures[:] = 0.0

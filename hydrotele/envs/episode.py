@@ -188,6 +188,25 @@ def mix64(z):
 
 
 @compiled
+def arm_values(f, values):
+    """Return the values (k,) of the axes of the arm.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        values: (>= axes,) of all axes.
+
+    Returns:
+        (k,) of the axes of the arm, from the swing outwards.
+
+    Source: the order of axes follows the pumps, see `actuator_layout.actuator_order`.
+    """
+    out = np.empty(f.arm_axes)
+    for a in range(f.arm_axes):
+        out[a] = values[f.driven_axis[a]]
+    return out
+
+
+@compiled
 def draw_uniform(e):
     """Draw a random number, uniform in [0, 1), from the generator of an episode.
 

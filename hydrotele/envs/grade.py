@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import MAX_ARM_AXES, MAX_PARAMETERS, draw_uniform, draw_uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, MAX_PARAMETERS, arm_values, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, max_reach
 from hydrotele.envs.soil_bed import (
     CELL_COUNT,
@@ -212,7 +212,7 @@ def write_grade_observation(f, e, w, out, at):
     """
     g, surface = e.goal, soil_surface_view(w)
     pose = np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
     for p in range(SECTION_COUNT):
         first = FIRST_CELL + p * _CELLS_PER_SECTION

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.envs.episode import MAX_ARM_AXES
+from hydrotele.envs.episode import MAX_ARM_AXES, arm_values
 from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.machine.machine import Machine
 
@@ -142,7 +142,7 @@ def write_machine_observation(f, e, out):
             out[at] = e.supply[i]
             at += 1
     pose = np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
     for c in range(max(4, f.arm_axes)):
         out[at] = pose[c]
         at += 1

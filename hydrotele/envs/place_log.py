@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, max_reach
 from hydrotele.envs.task import Task, sample_start_positions
 from hydrotele.envs.task_interface import (
@@ -285,7 +285,7 @@ def draw_log_poses(f, e, w):
     Source: this module.
     """
     g, pose, at = e.goal, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
-    compute_tip_pose(f.arm, e.position[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, arm_values(f, e.position), pose)
     radius, theta = (
         draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
         pose[1] + _draw_with_random_sign(e, _LOG_ANGLES),

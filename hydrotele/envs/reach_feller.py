@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_pose_observation_fields, max_reach
 from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
 from hydrotele.envs.task_interface import (
@@ -83,7 +83,7 @@ def draw_reach_goal(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, e.position[: f.arm_axes], start)
+    compute_tip_pose(f.arm, arm_values(f, e.position), start)
     size = 1.0
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
@@ -132,9 +132,10 @@ def combine_pose_errors(distance, angle):
 
 @compiled
 def _compute_true_pose_errors(f, e):
-    attitude = e.position[1] + e.position[2] + e.position[3]
+    arm = arm_values(f, e.position)
+    attitude = arm[1] + arm[2] + arm[3]
     target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
-    return compute_pose_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
+    return compute_pose_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, arm[4])
 
 
 @compiled

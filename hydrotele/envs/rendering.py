@@ -54,7 +54,7 @@ def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
 
     It follows from the true swing angle of the simulation `number`.
     """
-    swing = float(core.episodes["position"][number][0])
+    swing = float(core.episodes["position"][number][core.parameters["driven_axis"][0]])
     c, s = math.cos(swing), math.sin(swing)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -150,7 +150,8 @@ def _make_track_markers(core: TaskCore, number: int) -> list[Marker]:
     def tip_position_at(time: float) -> np.ndarray:
         joints, pose = np.empty(k), np.empty(MAX_ARM_AXES)
         for axis in range(k):
-            joints[axis] = compute_axis_reference(episode["goal"], axis, time)[0]
+            driven = int(core.parameters["driven_axis"][axis])
+            joints[axis] = compute_axis_reference(episode["goal"], driven, time)[0]
         compute_tip_pose(core.parameters["arm"], joints, pose)
         return pose_to_cartesian_position(pose)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
+from hydrotele.envs.episode import arm_values
 from hydrotele.kinematics.task_space import task_jacobian
 from hydrotele.soil.parameters import (
     CAT215,
@@ -175,10 +176,10 @@ def compute_bucket_edge_velocity(f, e, w, rates):
     """
     k = f.arm_axes
     jacobian = np.empty((k, k))
-    task_jacobian(f.arm, e.position[:k], jacobian)
+    task_jacobian(f.arm, arm_values(f, e.position), jacobian)
     rates[0], rates[1] = 0.0, 0.0
     for j in range(k):
-        speed = w.qvel[f.dof[j]]
+        speed = w.qvel[f.dof[f.driven_axis[j]]]
         rates[0] += jacobian[0, j] * speed
         rates[1] += jacobian[2, j] * speed
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_pose_observation_fields, max_reach
 from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
 from hydrotele.envs.task_interface import (
@@ -101,7 +101,7 @@ def draw_line_goal(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, e.position[: f.arm_axes], start)
+    compute_tip_pose(f.arm, arm_values(f, e.position), start)
     for c in range(4):
         g[_START + c] = start[c]
     speed, g[_ACCELERATION] = (
@@ -279,7 +279,8 @@ def compute_line_reward(f, e, w):
     compute_line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
     along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
-    attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
+    arm = arm_values(f, e.position)
+    attitude = arm[1] + arm[2] + arm[3] - pose[_ATTITUDE]
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
     return reward_from_errors(across, along, attitude), False
 

@@ -16,7 +16,7 @@ import numpy as np
 from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES
+from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES, arm_values
 from hydrotele.envs.observation import ObservationField
 from hydrotele.kinematics.task_space import REACHED, compute_joint_rates, compute_tip_pose, solve_joint_angles
 from hydrotele.machine.machine import Machine
@@ -180,14 +180,15 @@ def compute_path_effort(f, start, change):
             pose[c] = start[c] + change[c] * n / _PATH_SEGMENTS
         if solve_joint_angles(f.arm, pose, pose[1], q) != 0:
             return np.inf
-        for i in range(k):
-            if not f.ranges[i, 0] + _PATH_MARGIN <= q[i] <= f.ranges[i, 1] - _PATH_MARGIN:
+        for a in range(k):
+            i = f.driven_axis[a]
+            if not f.ranges[i, 0] + _PATH_MARGIN <= q[a] <= f.ranges[i, 1] - _PATH_MARGIN:
                 return np.inf
         if compute_joint_rates(f.arm, q, pose, change, rates) != 0:
             return np.inf
         effort = 0.0
-        for i in range(k):
-            effort += abs(rates[i]) / f.fastest[i]
+        for a in range(k):
+            effort += abs(rates[a]) / f.fastest[f.driven_axis[a]]
         worst = max(worst, effort)
     return worst
 
@@ -206,7 +207,7 @@ def compute_measured_pose(f, e, pose):
 
     Source: `kinematics.task_space.compute_tip_pose`.
     """
-    compute_tip_pose(f.arm, e.joint[: f.arm_axes], pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
 
 
 @compiled

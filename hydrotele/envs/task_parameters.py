@@ -41,8 +41,7 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
         () record.
 
     Raises:
-        InputError: the kind of actions or the sensors do not exist, or the arm's axes are not the
-            first axes of the machine.
+        InputError: the kind of actions or the sensors do not exist.
         RuntimeError: the memory layout of MuJoCo's structs is not the expected one.
     """
     facts = np.zeros((), TASK_PARAMETERS)
@@ -59,8 +58,6 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)
     facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
     columns = [plant.axes.index(name) for name in setup.axes]
-    if columns[: setup.arm_axes] != list(range(setup.arm_axes)):
-        raise InputError(f"machine {task.machine}", "the axes of its arm must come first")
     facts["driven_axis"][: len(columns)] = columns
     k, model = len(plant.axes), plant.model
     facts["qpos"][:k], facts["dof"][:k] = plant.qpos, plant.dof

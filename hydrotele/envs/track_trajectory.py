@@ -175,8 +175,8 @@ def compute_track_reward(f, e, w):
     """
     now = e.tick * f.period
     q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
-    for i in range(f.arm_axes):
-        q[i] = compute_axis_reference(e.goal, i, now)[0]
+    for a in range(f.arm_axes):
+        q[a] = compute_axis_reference(e.goal, f.driven_axis[a], now)[0]
     compute_tip_pose(f.arm, q, pose)
     x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
     square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2

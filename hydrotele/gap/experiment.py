@@ -368,6 +368,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "bulk_modulus": ("stairs",),
     "entrained_air": ("stairs",),
     "pump_flow_limit": ("surges",),
+    "merging_valve": ("surges",),
     "relief_pressure": ("surges",),
     "pressure_offset": ("poses", "reversals"),
     "pressure_scale": ("poses", "reversals"),

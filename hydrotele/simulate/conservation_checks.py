@@ -82,7 +82,7 @@ def _compute_work_and_volume_error(plant, x, v, act, more, dt):
     worst = 0.0
     power = np.zeros(len(x))
     for i in range(count):
-        power += (table[:, 3 + 3 * i] + more[:, i, 0]) * v[:, i]
+        power += (table[:, 4 * i + 3] + more[:, i, 0]) * v[:, i]
         worst = max(worst, *_volume_errors(plant, i, table, act, x, v, more, dt))
     return np.concatenate([[0.0], np.cumsum(0.5 * dt * (power[1:] + power[:-1]))]), worst
 
@@ -107,8 +107,8 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
     leak = drive.leakage * (p_head - p_rod)
     release = supply.dissolved_air * supply.bulk_modulus
     sides = (
-        (p_head, table[:, 1 + 3 * i] - leak + more[:, i, 1], head * v[:, i], volume_head),
-        (p_rod, table[:, 2 + 3 * i] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
+        (p_head, table[:, 4 * i + 1] - leak + more[:, i, 1], head * v[:, i], volume_head),
+        (p_rod, table[:, 4 * i + 2] + leak + more[:, i, 2], -rod * v[:, i], volume_rod),
     )
     for pressure, inflow, swept, volume in sides:
         port, bubbles, oil = _compute_port_flows_and_air(
@@ -147,7 +147,7 @@ def _flows_after_switching(plant, i, act, x, v):
     """Return flows and forces at the start of every step, after the valve of axis i has switched.
 
     Axis i has its own pump. Its valve switches at the start of a step, while the pump keeps its
-    speed. The result (n, 1 + 3 count) is that of `compute_state_flows_and_forces` with this signed
+    speed. The result (n, 4 count) is that of `compute_state_flows_and_forces` with this signed
     pump speed.
     """
     switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
@@ -175,7 +175,7 @@ def _compute_pump_axis_volume_errors(axis, i, table, began, act, x, v, more, dt)
          pump.compliance_rod, pump.air_rod),
     )  # fmt: skip
     for pressure, column, besides, swept, volume, walls, air in sides:
-        inflow, first = (t[:, column + 3 * i] + besides for t in (table, began))
+        inflow, first = (t[:, 4 * i + column] + besides for t in (table, began))
         entered = np.sum(0.5 * dt * ((inflow - swept)[1:] + (first - swept)[:-1]))
         soft = np.array([
             chamber_compliance(each, pump.bulk_modulus, walls, air, p)

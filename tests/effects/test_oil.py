@@ -22,7 +22,7 @@ def flows(machine, spool):
     count = plant.hydraulic
     user = plant.model.actuator_user.ravel()
     table = compute_state_flows_and_forces(user, count, data.act[None], np.full((1, count), 0.5), np.zeros((1, count)))
-    return table[0, 0], table[0, 1 + 3 * BOOM]
+    return table[0, 0], table[0, 4 * BOOM + 1]
 
 
 def pressure_rate(machine, velocity=0.0, difference=0.0):

@@ -20,9 +20,14 @@ def core() -> TaskCore:
     return TaskCore(REACH, Options(variants=4), COUNT, 1, DISABLED)
 
 
+def arm_positions(core: TaskCore) -> np.ndarray:
+    """Positions (n, 5) of the arm's axes from the swing outwards; the axes of a machine follow its pumps."""
+    return np.ascontiguousarray(core.episodes["position"][:, core.parameters["driven_axis"][:5]])
+
+
 def true_pose(core: TaskCore, n: int) -> np.ndarray:
     pose = np.zeros(MAX_ARM_AXES)
-    compute_tip_pose(core.parameters["arm"], core.episodes["position"][n, :5], pose)
+    compute_tip_pose(core.parameters["arm"], arm_positions(core)[n], pose)
     return pose
 
 
@@ -31,13 +36,15 @@ def left(core: TaskCore) -> tuple[np.ndarray, np.ndarray]:
     e, target = core.episodes, core.episodes["goal"][:, :MAX_ARM_AXES]
     place = np.stack([target[:, 0] * np.cos(target[:, 1]), target[:, 0] * np.sin(target[:, 1]),
                       target[:, 2]], axis=1)  # fmt: skip
-    attitude = np.abs(e["position"][:, 1:4].sum(axis=1) - target[:, 3])
-    head = np.abs(e["position"][:, 4] - target[:, 4])
+    joints = arm_positions(core)
+    attitude = np.abs(joints[:, 1:4].sum(axis=1) - target[:, 3])
+    head = np.abs(joints[:, 4] - target[:, 4])
     return np.linalg.norm(e["tip"] - place, axis=1), np.maximum(attitude, head)
 
 
 def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
-    arm, ranges, joints = core.parameters["arm"], core.parameters["ranges"][:5], np.zeros(5)
+    arm, joints = core.parameters["arm"], np.zeros(5)
+    ranges = core.parameters["ranges"][core.parameters["driven_axis"][:5]]
     core.reset(np.arange(COUNT))
     far = []
     for _ in range(6):

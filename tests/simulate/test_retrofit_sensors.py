@@ -33,7 +33,8 @@ def test_imu_readings_of_mujoco_agree_with_the_chain_model():
         for key, values in zip(states, motion[:, a], strict=True):
             states[key][:, joint.qposadr[0] if key == "qpos" else joint.dofadr[0]] = values
     empty = np.zeros((rows, 0))
-    record = Record(np.arange(rows) * 0.02, **states, act=empty, command=empty, contact=empty, contact_of={}, tip=empty,
+    record = Record(np.arange(rows) * 0.02, **states, act=empty, command=empty, contact=empty, load=np.zeros(rows),
+                    contact_of={}, tip=empty,
                     delayed_readings=empty)  # fmt: skip
     found = compute_link_motion(plant.model, record, [plant.model.body(name).id for name in sensors])
     expected = predict_imu_readings(chain, motion, np.zeros((3, 9)), np.zeros(2))
