@@ -104,7 +104,9 @@ def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(na
     assert np.array_equal(marked, first)
     canvas.close()
     for _ in range(50):
-        env.step(np.ones(env.action_space.shape, np.float32))
+        _, _, terminated, truncated, _ = env.step(np.ones(env.action_space.shape, np.float32))
+        if terminated or truncated:
+            break
     assert (env.render() != first).any(axis=2).mean() > 0.01
     env.close()
 
