@@ -29,6 +29,7 @@ from hydrotele.calibrate.imu_model import ImuChain, build_imu_chain, predict_imu
 from hydrotele.calibrate.imu_smoother import ImuParameters, ImuRun, SmoothedImus, SmoothedRun, smooth_imus
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.effects import EFFECTS
 from hydrotele.logs.log import Log
 from hydrotele.logs.run_files import read_runs
 from hydrotele.machine.machine import IDEAL_SENSORS, Machine, find_channel_sensor, get_sensor_set
@@ -43,6 +44,7 @@ _START_SD = 1e-4  # [rad], of the arbitrary initial position of a vertical axis
 _VERTICAL_COSINE = 0.94  # cosine of the angle (20 deg) to gravity below which gravity determines a joint
 _GRAVITY_TIME = 4.0  # [s], time over which gravity corrects the initial positions, longer than accelerations last
 _RELATIVE_ERROR = 0.02  # of accelerations of links: scale and cross-axis error of MEMS accelerometers, flexible links
+_MOTION_TIME = 1.0  # [s], correlation time of these errors: that of motions of a heavy machine
 _MOTION_BANDWIDTH = 4.0  # [Hz], above that of hydraulic drives and below the vibrations of their oil columns and links
 _POSE = re.compile(r"(?:(?P<run>[^@\s]+)@)?(?P<time>[-+.\deE]+)\s+(?P<values>.+)")
 MAX_SD_RATIO = 0.7  # a parameter with a larger ratio of posterior to prior standard deviation is not identifiable
@@ -160,9 +162,10 @@ def calibrate_imus(
     complete = (_add_vibration(chain, run, motion, smoothed.parameters, k)
                 for k, (run, motion) in enumerate(zip(runs, smoothed.runs, strict=True)))  # fmt: skip
     smoothed = smoothed._replace(runs=tuple(complete))
-    calibrated = _write_parameters(machine, chosen, chain, smoothed)
-    derived = tuple(_add_positions(log, machine, chain, run.motion, measured)
-                    for log, run in zip(logs, smoothed.runs, strict=True))  # fmt: skip
+    calibrated = _write_parameters(machine, chosen, chain, smoothed, noise[:, 0], measured)
+    rates = (_measured_rates(chain, run, smoothed.parameters, k) for k, run in enumerate(runs))
+    derived = tuple(_add_positions(log, machine, chain, run.motion, rate, measured)
+                    for log, run, rate in zip(logs, smoothed.runs, rates, strict=True))  # fmt: skip
     return ImuCalibration(calibrated, chosen, chain, smoothed, prior_sd, derived, tuple(dict.fromkeys(notes)))
 
 
@@ -246,24 +249,47 @@ def _estimate_start(chain: ImuChain, run: ImuRun) -> np.ndarray:
 def _integrate_joint_rate(
     chain: ImuChain, run: ImuRun, index: int, mounting: np.ndarray, bias: np.ndarray
 ) -> np.ndarray:
-    """Return the integral (n,) of the rate of the joint of a link, from the gyros of the link and its parent.
+    """Return the integral (n,) of the rate of the joint of a link."""
+    relative = _fill_gaps(run.time, _joint_rate(chain, run, index, mounting, bias))
+    return np.concatenate([[0.0], np.cumsum(0.5 * (relative[1:] + relative[:-1]) * np.diff(run.time))])
+
+
+def _joint_rate(chain: ImuChain, run: ImuRun, index: int, mounting: np.ndarray, bias: np.ndarray) -> np.ndarray:
+    """Return the rate (n,) of the joint of a link, from the gyros of the link and its parent.
 
     The component of an angular rate along the joint axis is the same in the axes of both links.
     """
     rates = []
-    for place in (index, chain.links[index].parent):
-        imu = _imu_on_link(chain, place)
-        if imu is None:
-            continue
+    for imu in _imus_of_joint(chain, index):
         frame = Rotation.from_rotvec(chain.sensors[imu].rotation).as_matrix() @ rotation_from_parameters(
             mounting[imu, :3]
         )
         joint = chain.links[index].joint
         assert joint
-        rate = np.array(joint.axis) @ frame @ (run.readings[imu, :3] - bias[imu][:, None])
-        rates.append(_fill_gaps(run.time, rate))
-    relative = rates[0] - rates[1] if len(rates) == 2 else rates[0]
-    return np.concatenate([[0.0], np.cumsum(0.5 * (relative[1:] + relative[:-1]) * np.diff(run.time))])
+        rates.append(np.array(joint.axis) @ frame @ (run.readings[imu, :3] - bias[imu][:, None]))
+    return rates[0] - rates[1] if len(rates) == 2 else rates[0]
+
+
+def _measured_rates(chain: ImuChain, run: ImuRun, found: ImuParameters, place: int) -> dict[int, np.ndarray]:
+    """Return axis index -> joint rate (n,) that gyros measure with white noise, for hinges with an IMU."""
+    return {
+        link.axis: _joint_rate(chain, run, k, found.mounting, found.gyro_bias[place])
+        for k, link in enumerate(chain.links) if _is_rate_measured(chain, k)
+    }  # fmt: skip
+
+
+def _imus_of_joint(chain: ImuChain, index: int) -> list[int]:
+    """Return the IMUs on a link and on its parent, as far as there are any."""
+    imus = (_imu_on_link(chain, place) for place in (index, chain.links[index].parent))
+    return [imu for imu in imus if imu is not None]
+
+
+def _is_rate_measured(chain: ImuChain, index: int) -> bool:
+    """Return whether gyros measure the rate of a link's hinge: on the link, and on its parent or a fixed parent."""
+    link = chain.links[index]
+    if link.axis < 0 or link.joint is None or link.joint.type != "hinge" or _imu_on_link(chain, index) is None:
+        return False
+    return _imu_on_link(chain, link.parent) is not None or _is_fixed_to(chain, link.parent, -1)
 
 
 def _imu_on_link(chain: ImuChain, index: int) -> int | None:
@@ -277,6 +303,8 @@ def _filter_run(chain: ImuChain, run: ImuRun, start: np.ndarray) -> ImuRun:
     """Return a run with low-pass filtered readings, and the errors of the accelerometers in motion.
 
     The error is proportional to the accelerations of the links, which follow from the initial joint positions (a, n).
+    It lasts as long as a motion, and the rows of one motion are no independent readings of it: as white noise, which
+    the smoother assumes, it is larger by the root of the number of these rows.
     """
     slow = [_low_pass(run.time, q) for q in start]
     rates = [np.gradient(q, run.time) for q in slow]
@@ -284,7 +312,8 @@ def _filter_run(chain: ImuChain, run: ImuRun, start: np.ndarray) -> ImuRun:
     still = motion * np.array([1.0, 0.0, 0.0])[:, None, None]
     stated = np.zeros((len(chain.imus), 9)), np.zeros(2)
     moving = predict_imu_readings(chain, motion, *stated) - predict_imu_readings(chain, still, *stated)
-    error = _RELATIVE_ERROR * np.linalg.norm(moving[:, 3:], axis=1)
+    rows = max(1.0, _MOTION_TIME / float(np.median(np.diff(run.time))))
+    error = np.sqrt(rows) * _RELATIVE_ERROR * np.linalg.norm(moving[:, 3:], axis=1)
     readings = np.array([[_low_pass(run.time, v) for v in imu] for imu in run.readings])
     return run._replace(readings=readings, accelerometer_error=error)
 
@@ -399,8 +428,15 @@ def _make_prior(chain: ImuChain, runs: int, slope_sd: float) -> tuple[ImuParamet
     return mean, deviation, np.array(noise).reshape(count, 2)
 
 
-def _write_parameters(machine: Machine, name: str, chain: ImuChain, smoothed: SmoothedImus) -> Machine:
-    """Return the machine with calibrated mountings, biases, their uncertainties, and the noise of the positions."""
+def _write_parameters(
+    machine: Machine, name: str, chain: ImuChain, smoothed: SmoothedImus, gyro_noise: np.ndarray,
+    measured: Sequence[str],
+) -> Machine:  # fmt: skip
+    """Return the machine with calibrated mountings, biases, their uncertainties, and the noise of positions and rates.
+
+    The errors of the derived positions are those of the sensors that the machine then has for the other axes than
+    `measured`: noise with a correlation time, and an uncertain offset. Their rates are measured by gyros.
+    """
     found, deviation = smoothed.parameters, smoothed.standard_deviations
     sensors = machine.sensors[name]
     mounted = dict(sensors.mounted)
@@ -418,23 +454,42 @@ def _write_parameters(machine: Machine, name: str, chain: ImuChain, smoothed: Sm
             "rotation_sd": float(deviation.mounting[k, :3].max()),
             "accelerometer_bias_sd": float(deviation.mounting[k, 3:6].max()),
         })  # fmt: skip
-    channels = dict(sensors.channels)
+    channels, uncertainty = dict(sensors.channels), dict(machine.uncertainty)
     for a, axis in enumerate(chain.axes):
-        noise = max(run.noise[a] for run in smoothed.runs)
-        channels[f"{machine.position_kind(axis)}.{axis}"] = Sensor(standard_deviation=float(noise))
+        if axis in measured:
+            continue
+        noise, offset, time = (
+            float(max(getattr(run, kind)[a] for run in smoothed.runs))
+            for kind in ("noise", "offset", "correlation_time")
+        )
+        channels[f"{machine.position_kind(axis)}.{axis}"] = Sensor(standard_deviation=noise, correlation_time=time)
+        prior = EFFECTS["angle_offset"].parameters(machine, axis)["offset"].prior_std
+        uncertainty[f"angle_offset.{axis}"] = offset / prior
+    for index, link in enumerate(chain.links):
+        if _is_rate_measured(chain, index) and chain.axes[link.axis] not in measured:
+            noise = float(np.linalg.norm(gyro_noise[_imus_of_joint(chain, index)]))
+            channels[f"velocity.{chain.axes[link.axis]}"] = Sensor(standard_deviation=noise)
     made = sensors.model_copy(update={"mounted": mounted, "channels": channels})
     tilt = rotation_from_parameters(np.append(found.tilt, 0.0)).T
     gravity = tuple(map(float, tilt @ np.array(machine.gravity))) if found.tilt.any() else machine.gravity
-    return machine.model_copy(update={"sensors": {**machine.sensors, name: made}, "gravity": gravity})
+    return machine.model_copy(
+        update={"sensors": {**machine.sensors, name: made}, "gravity": gravity, "uncertainty": uncertainty}
+    )
 
 
-def _add_positions(log: Log, machine: Machine, chain: ImuChain, motion: np.ndarray, measured: Sequence[str]) -> Log:
-    """Return a log with the derived positions and rates of the axes without a joint sensor."""
+def _add_positions(
+    log: Log, machine: Machine, chain: ImuChain, motion: np.ndarray, rates: Mapping[int, np.ndarray],
+    measured: Sequence[str],
+) -> Log:  # fmt: skip
+    """Return a log with the derived positions and rates of the axes without a joint sensor.
+
+    The rates are those of the gyros where there are any: unlike the smoothed ones, their errors are independent.
+    """
     columns, units = dict(log.columns), dict(log.units)
     for a, axis in enumerate(chain.axes):
         kind = machine.position_kind(axis)
         unit = "rad" if kind == "angle" else "m"
         if axis not in measured:
             columns[f"{kind}.{axis}"], units[f"{kind}.{axis}"] = motion[0, a], unit
-        columns[f"velocity.{axis}"], units[f"velocity.{axis}"] = motion[1, a], f"{unit}/s"
+        columns[f"velocity.{axis}"], units[f"velocity.{axis}"] = rates.get(a, motion[1, a]), f"{unit}/s"
     return dataclasses.replace(log, columns=columns, units=units)

@@ -81,6 +81,7 @@ class SmoothedRun(NamedTuple):
         motion: (3, a, n) joint positions, velocities and accelerations at the rows.
         noise: (a,) median standard deviation of a position due to the noise of the readings [rad] or [m].
         offset: (a,) median standard deviation of a position due to the parameters [rad] or [m].
+        correlation_time: (a,) integral of the correlation of the errors due to noise over time differences [s].
         residual_rms: (s, 2) RMS of the residuals of gyro and accelerometer, relative to the stated noise.
     """
 
@@ -88,6 +89,7 @@ class SmoothedRun(NamedTuple):
     motion: np.ndarray
     noise: np.ndarray
     offset: np.ndarray
+    correlation_time: np.ndarray
     residual_rms: np.ndarray
 
 
@@ -156,12 +158,11 @@ def smooth_imus(
     covariance, _, factors = _reduce(normals, parameters, mean.to_vector(), prior_sd.to_vector())
     results = []
     for k, (run, spline, solved) in enumerate(zip(runs, splines, coefficients, strict=True)):
-        white, common = _position_deviations(spline, factors[k], normals[k].border, covariance, run.position.shape[0])
-        results.append(
-            SmoothedRun(
-                run.name, _evaluate(spline, solved), white, common, rms[k] * noise[k] / stated / np.sqrt(bandwidth)
-            )
-        )
+        axes = run.position.shape[0]
+        white, common = _position_deviations(spline, factors[k], normals[k].border, covariance, axes)
+        times = _correlation_times(spline, factors[k], axes)
+        excess = rms[k] * noise[k] / stated / np.sqrt(bandwidth)
+        results.append(SmoothedRun(run.name, _evaluate(spline, solved), white, common, times, excess))
     deviations = mean.from_vector(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
     return SmoothedImus(mean.from_vector(parameters), deviations, tuple(results))
 
@@ -350,6 +351,20 @@ def _residual_rms(runs: list[ImuRun], normals: list[_Normal]) -> np.ndarray:
     """Return the RMS (r, s, 2) of the weighted residuals of gyros and accelerometers."""
     counts = np.array([np.isfinite(run.readings).reshape(len(run.readings), 2, -1).sum(axis=2) for run in runs])
     return np.sqrt(np.array([normal.squares for normal in normals]) / np.maximum(counts, 1))
+
+
+def _correlation_times(spline: _Spline, factor, axes: int) -> np.ndarray:
+    """Return the integral (a,) of the correlation of position errors due to noise about the middle of a run [s]."""
+    row = len(spline.interval) // 2
+    unit = np.zeros((spline.count * axes, axes))
+    for a in range(axes):
+        unit[(spline.interval[row] + np.arange(_DEGREE + 1)) * axes + a, a] = spline.basis[0, row]
+    solved = cho_solve_banded((factor, True), unit)
+    times = np.empty(axes)
+    for a in range(axes):
+        covariance = _evaluate(spline, solved[:, a].reshape(spline.count, axes))[0, a]
+        times[a] = spline.step * np.sum(covariance) / covariance[row]
+    return times
 
 
 def _position_deviations(spline: _Spline, factor, border, covariance, axes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,7 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import pressure_with_released_air, pressure_without_released_air
 from hydrotele.machine.log_channels import parse_channel
-from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine import Machine, rate_channels
 from hydrotele.machine.sensors import SensorError, step_first_order_lag, warming_drift
 from hydrotele.multibody.reduced_dynamics import (
     BIAS,
@@ -69,10 +69,10 @@ from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
 from hydrotele.terms.table import has_term, sum_terms_with_slope
 
-POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
+POSITION, LENGTH, HEAD, ROD, SUPPLY, VELOCITY = range(6)
 _KINDS = {
     "angle": POSITION, "position": POSITION, "length": LENGTH, "pressure_head": HEAD,
-    "pressure_rod": ROD, "pressure_supply": SUPPLY,
+    "pressure_rod": ROD, "pressure_supply": SUPPLY, "velocity": VELOCITY,
 }  # fmt: skip
 GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH = range(4)  # columns of `transmission`
 X, V, COMMAND, GIVEN, INERTIA = range(5)  # rows of `Space.drive`
@@ -95,7 +95,7 @@ class Model(NamedTuple):
         delay: (nu,) command delays [s].
         gear: (nu,) transmission of every drive, -1 if rigid.
         transmission: (t, 4) GEAR_INERTIA, STIFFNESS, GEAR_DAMPING, BACKLASH in SI.
-        kind: (c,) what every channel shows: POSITION, LENGTH, HEAD, ROD or SUPPLY.
+        kind: (c,) what every channel shows: POSITION, LENGTH, HEAD, ROD, SUPPLY or VELOCITY.
         drive: (c,) drive of every channel; of a supply the first that it feeds.
         scale: (c,) sensor scales [1].
         offset: (c,) sensor offsets [channel's unit].
@@ -154,13 +154,14 @@ class Space(NamedTuple):
 
 
 def predicted_channels(machine: Machine) -> tuple[str, ...]:
-    """Channels that the reduced model predicts: positions, lengths, pressures, supply."""
+    """Channels that the reduced model predicts: positions, lengths, pressures, supply, measured rates."""
     order = actuator_order(machine)
     valves = list(machine.hydraulic_axes)
     names = [f"{machine.position_kind(a)}.{a}" for a in order]
     names += [f"length.{a}" for a in order if machine.axes[a].cylinder]
     names += [f"pressure_{side}.{a}" for a in valves for side in ("head", "rod")]
-    return (*names, *machine.supply_channels) if machine.valve_axes else tuple(names)
+    supplies = machine.supply_channels if machine.valve_axes else ()
+    return (*names, *supplies, *rate_channels(machine))
 
 
 def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
@@ -776,6 +777,8 @@ def _shown(model, sp, z, c):
     kind, i = model.kind[c], model.drive[c]
     if kind == POSITION:
         return sp.motion.joint[Q, model.mech.drive[i, JOINT]]
+    if kind == VELOCITY:
+        return sp.motion.joint[RATE, model.mech.drive[i, JOINT]]
     if kind == LENGTH:
         return sp.drive[X, i]
     if kind == SUPPLY:

@@ -70,7 +70,7 @@ from hydrotele.gap.run_differences import (
 from hydrotele.gap.search import Found, lacking, search
 from hydrotele.gap.verdict import compare_held_out, count_unexplained
 from hydrotele.gap.verdict import verdict_of as verdict_of_regression
-from hydrotele.logs.dataset import Dataset, RunData
+from hydrotele.logs.dataset import Dataset, RunData, exchange_heldout
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
@@ -113,6 +113,8 @@ def find_gap(
     keep: Callable[[Interim], None] | None = None,
     method: Method = "search",
     warn: Callable[[str], None] = lambda text: None,
+    *,
+    may_exchange: bool = True,
 ) -> Gap:
     """Find where a model and its logs disagree.
 
@@ -125,6 +127,8 @@ def find_gap(
         keep: called with the best answer so far, each time that there is a better one.
         method: `search`, or `regression` of `gap.model_search`.
         warn: called with one sentence per gross error of the logs, before the search.
+        may_exchange: whether the regression may hold out another run, if the held-out run shows an effect that the
+            fitted runs do not show and do not contradict.
 
     Returns:
         The gap, named or not.
@@ -136,7 +140,7 @@ def find_gap(
     is_regression = method == "regression"
     begin = time.perf_counter()
     report = progress or (lambda text, share: None)
-    given, notes = data.machine, []
+    logged, given, notes = data, data.machine, []
     opened = None if effects else calibrate_freely(data, jobs, lambda text: report(text, 0.0))
     if opened:
         data = dataclasses.replace(data, machine=opened.machine)
@@ -176,6 +180,9 @@ def find_gap(
             tell("compare the held-out run with the fitted runs", 0.92)
             own = compare_heldout(evidence, found, candidates)
             found = own.found
+            if own.is_open and may_exchange:
+                report("hold out another run", 0.0)
+                return find_gap(exchange_heldout(logged), progress, effects, jobs, keep, method, may_exchange=False)
         if is_regression and found.guess.parts:
             tell("compare with the given machine on the held-out run", 0.94)
             held_out = compare_held_out(evidence, found.base, found.judged)

@@ -15,7 +15,7 @@ from hydrotele.estimate.evidence import Evidence, invert_information
 from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.machine_model import MachineModel
-from hydrotele.gap.model_search import Model, add_effects, settle, settle_noise
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, Model, add_effects, settle, settle_noise
 from hydrotele.gap.result import RunDifference
 from hydrotele.gap.run_differences import between_runs, difference_in_run, list_quantities
 from hydrotele.gap.search import Found
@@ -28,11 +28,14 @@ class HeldOut(NamedTuple):
         found: the accepted model, with this run's parameters.
         spread: parameter that differs between runs -> standard deviation of this run's normalised deviation.
         differences: of this run alone.
+        is_open: whether there are such differences and the fitted runs do not contradict them: they may act in all
+            runs, without effect on the motion of the fitted ones.
     """
 
     found: Found
     spread: dict[str, float]
     differences: tuple[RunDifference, ...]
+    is_open: bool = False
 
 
 def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypothesis]) -> HeldOut:
@@ -75,9 +78,21 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
             if h.size:
                 differences.append(difference_in_run(h, d, sizes[first : first + h.size], run.name))
             first += h.size
-        return HeldOut(found, spread, tuple(differences))
+        return HeldOut(found, spread, tuple(differences), _are_compatible(evidence, found, last.guess))
     finally:
         other.close()
+
+
+def _are_compatible(evidence: Evidence, found: Found, heldout: Guess) -> bool:
+    """Return whether the differences of the held-out run are as likely in the fitted runs as no difference."""
+    common = found.guess
+    for h, deviation in heldout.parts:
+        if h.size and h.name != BETWEEN_RUNS:  # a disturbance, at a time of this run
+            return False
+        if h.size:
+            common = common.plus(replace(h, runs=()), deviation)
+    now, tried = (settle_noise(MachineModel(evidence), evidence.judged(g)) for g in (found.guess, common))
+    return tried.loss - common.prior < now.loss - found.guess.prior + MIN_LOG_BAYES_FACTOR
 
 
 def _select_run(h: Hypothesis, deviation: np.ndarray, run: str) -> tuple[Hypothesis, np.ndarray]:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 from scipy.special import expit
+from scipy.stats import chi2
 
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED, Guess
@@ -44,6 +45,7 @@ _WINDOW = 1.0  # s, longer than any ringing of the errors, shorter than a motion
 _LAGS = 5
 LIMITS = {"mean_square": 1.12, "window_means": 1.8, "autocorrelation": 60.0}
 """Largest value of a test in any channel that still passes, for a smooth model."""
+_FALSE_ALARMS = 0.01  # largest probability that white noise alone exceeds the limit of a test in any channel
 
 
 def residual_tests(
@@ -53,7 +55,8 @@ def residual_tests(
 
     Where a model has backlash or late sensors, a filter that takes everything for locally straight
     leaves errors even on readings that the model itself made. A test then allows five times what
-    those leave in a channel beyond white noise.
+    those leave in a channel beyond white noise. Of few readings, mean squares scatter: their limits
+    are at least the quantile of the chi-square distribution that white noise exceeds in 1 % of datasets.
 
     Args:
         tracks: the model's tracks, each with gains of its own.
@@ -66,11 +69,12 @@ def residual_tests(
         times their length; `autocorrelation`: sum over 5 lags of n r^2, mean over the runs, less
         its expectation 5.
     """
-    values = _values(tracks)
-    own = _values(perfect) if perfect else [np.full(len(channels), e) for e in _EXPECTED]
+    values, counts = _values(tracks)
+    own = _values(perfect)[0] if perfect else [np.full(len(channels), e) for e in _EXPECTED]
     found = {}
-    for name, measured, made, white in zip(LIMITS, values, own, _EXPECTED, strict=True):
-        limits = np.maximum(LIMITS[name], white + ALLOWED * (made - white))
+    for name, measured, made, white, count in zip(LIMITS, values, own, _EXPECTED, counts, strict=True):
+        scatter = chi2.isf(_FALSE_ALARMS / len(channels), count) / count if len(count) else LIMITS[name]
+        limits = np.maximum(np.maximum(LIMITS[name], scatter), white + ALLOWED * (made - white))
         worst = int(np.argmax(measured / limits))
         found[name] = {
             "value": float(measured[worst]),
@@ -81,18 +85,23 @@ def residual_tests(
     return found
 
 
-def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
-    """Per test the values (c,) of all channels over all runs."""
+def _values(tracks: Sequence[Track]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Per test the values (c,) of all channels over all runs, and the numbers (c,) of squares in their means.
+
+    The numbers of the last test are empty.
+    """
     parts = [_measures(track.whitened, track.run.period) for track in tracks]
     weights = np.array([p[0] for p in parts])
     total = np.maximum(weights.sum(axis=0), 1.0)
-    return [
+    values = [
         np.sum(weights * np.array([p[index] for p in parts]), axis=0) / total for index in range(1, 1 + len(LIMITS))
     ]
+    windows = np.maximum(np.sum([p[-1] for p in parts], axis=0), 1.0)
+    return values, [total, windows, np.zeros(0)]
 
 
-def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
+def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, ...]:
+    """Per channel (c,): rows with a reading, mean square, window means, autocorrelation, number of windows."""
     w = settled(whitened, period)
     window = min(max(2, round(_WINDOW / period)), len(w))  # a shorter run is one window
     there = np.isfinite(w)
@@ -108,7 +117,7 @@ def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarr
     echo = np.zeros(w.shape[1])
     for lag in range(1, _LAGS + 1):
         echo += (w[lag:] * w[:-lag]).sum(axis=0) ** 2 / some / np.maximum(square, 1e-12) ** 2
-    return count, square, means, echo - _LAGS
+    return count, square, means, echo - _LAGS, full.sum(axis=0)
 
 
 def settled(whitened: np.ndarray, period: float) -> np.ndarray:

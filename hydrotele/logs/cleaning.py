@@ -216,7 +216,7 @@ def _find_frozen_intervals(data: _CleaningData, run: str, channel: str) -> list[
     if probability and is_noise_as_stated(sensor, channel, _first_noise_estimate(data, run, channel)):
         return find_frozen_by_noise(reading, probability, _count_readings(data), period)
     kind, _, axis = channel.partition(".")
-    if kind == "pressure_supply":  # may be constant at the relief pressure for any time
+    if kind in ("pressure_supply", "velocity"):  # may be constant at the relief pressure, or 0, for any time
         return []
     if kind.startswith("pressure"):
         other = "pressure_rod" if kind == "pressure_head" else "pressure_head"

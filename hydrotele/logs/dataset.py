@@ -26,7 +26,14 @@ from hydrotele.logs.resampling import RunRows, average_rows, merge_run, slice_ro
 from hydrotele.logs.run_files import RunFiles, check_commands, read_runs
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.log_columns import LogColumn
-from hydrotele.machine.machine import IDEAL_SENSORS, Machine, find_channel_sensor, get_sensor_set, reading_noise_rms
+from hydrotele.machine.machine import (
+    IDEAL_SENSORS,
+    Machine,
+    find_channel_sensor,
+    get_sensor_set,
+    rate_channels,
+    reading_noise_rms,
+)
 from hydrotele.machine.oil import kinematic_viscosity
 from hydrotele.machine.oil_temperature import with_oil_temperature
 from hydrotele.machine.sensors import SensorSet
@@ -42,7 +49,8 @@ _NAMES_WITHOUT_ACCURACY = (
 def predicted_channels(machine: Machine) -> tuple[str, ...]:
     """Return the names of all channels that the model of a machine predicts, in the order of a dataset.
 
-    They are the positions of the axes, cylinder lengths, chamber pressures and the supply pressure.
+    They are the positions of the axes, cylinder lengths, chamber pressures, the supply pressure, and the joint rates
+    that the machine's sensors measure.
     """
     order = actuator_order(machine)
     valves = [name for name in order if machine.axes[name].is_hydraulic]
@@ -52,6 +60,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
         *(f"pressure_head.{name}" for name in valves),
         *(f"pressure_rod.{name}" for name in valves),
         *(machine.supply_channels if machine.supply and valves else ()),
+        *rate_channels(machine),
     )
 
 
@@ -574,6 +583,7 @@ def make_dataset(
     for name, rows in mended.items():
         # C-contiguous: compiled filters would be recompiled for another memory layout
         rows = rows._replace(reading=np.ascontiguousarray(rows.reading[:, kept]))
+        _thin_correlated_readings(rows, machine, known, channels)
         whole[name], behind[name], count = average_rows(rows)
         if count > 1:
             notes.append(f"{name}: is logged at {1 / rows.period:.6g} Hz; {count} rows each were"
@@ -594,6 +604,26 @@ def make_dataset(
     notes += left
     return Dataset(machine, axes, channels, noise[kept], tuple(made.values()), judge, tuple(notes),
                    next((n for n, s in machine.sensors.items() if s is known), None), unused)  # fmt: skip
+
+
+def exchange_heldout(data: Dataset) -> Dataset:
+    """Hold out the last fitted run, and fit the run that was held out."""
+    *fit, run = data.fit
+    note = (
+        f"{run.name} is held out in place of {data.heldout.name}, which alone shows an effect that the other runs do"
+        " not contradict."
+    )
+    return dataclasses.replace(data, fit=(*fit, data.heldout), heldout=run, notes=(*data.notes, note))
+
+
+def _thin_correlated_readings(rows: RunRows, machine: Machine, sensors: SensorSet | None, channels) -> None:
+    """Remove readings in place, so that those of a sensor with correlated errors are a correlation time apart."""
+    for c, channel in enumerate(channels):
+        every = math.ceil(find_channel_sensor(machine, sensors, channel).correlation_time / rows.period)
+        if every > 1:
+            kept = rows.reading[::every, c].copy()
+            rows.reading[:, c] = np.nan
+            rows.reading[::every, c] = kept
 
 
 def _set_logged_oil_temperature(files: Sequence[RunFiles], machine: Machine) -> tuple[Machine, list[str]]:

@@ -50,6 +50,8 @@ def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
         mains = [pump.relief_pressure for pump in machine.pumps.values()]
         reliefs = [a.valve.port_relief for a in machine.hydraulic_axes.values() if a.valve]
         return _MIN_PRESSURE_READING, _MAX_PRESSURE_RATIO * max(*mains, *reliefs)
+    if kind == "velocity":
+        return -math.inf, math.inf
     if kind == "length":
         cylinder = machine.axes[axis].cylinder
         assert cylinder
@@ -124,7 +126,7 @@ def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: fl
 def find_spikes(machine: Machine, channel: str, reading: np.ndarray, period: float, noise: float) -> np.ndarray:
     """Find readings that are physically impossible: outside the plausible range, or single spikes.
 
-    Pressures are checked against `plausible_range` only, because they can change by 10 MPa within a
+    Pressures and rates are checked against `plausible_range` only, because they change by 10 MPa within a
     row. A position or length is also a spike if its two neighbours agree and it differs from their
     mean by more than 20 noise standard deviations and by more than any acceleration can explain.
 
@@ -141,7 +143,7 @@ def find_spikes(machine: Machine, channel: str, reading: np.ndarray, period: flo
     low, high = plausible_range(machine, channel)
     with np.errstate(invalid="ignore"):
         bad = (reading < low) | (reading > high) | np.isinf(reading)
-    if channel.startswith("pressure") or len(reading) < 3:
+    if channel.startswith(("pressure", "velocity")) or len(reading) < 3:
         return bad
     bend = reading[1:-1] - 0.5 * (reading[:-2] + reading[2:])
     apart = np.abs(reading[2:] - reading[:-2])

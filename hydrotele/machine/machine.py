@@ -462,7 +462,8 @@ class Machine(StrictModel):
             for mounted, sensor in sensors.mounted.items():
                 _check_name_is_known(sensor.link, known, f"sensors.{name}.mounted.{mounted}.link")
             for channel in sensors.channels:
-                _check_name_is_known(channel, self.sensed_channels, f"sensors.{name}.channels")
+                known = (*self.sensed_channels, *(f"velocity.{axis}" for axis in self.axes))
+                _check_name_is_known(channel, known, f"sensors.{name}.channels")
         for name, axis in self.axes.items():
             if axis.pump and self.joints[axis.joint].type != "slide":
                 raise ValueError(f"axes.{name}.pump: the axis must have a slide joint")
@@ -590,6 +591,7 @@ _SENSOR_KIND_OF_CHANNEL = {
     "pressure_head": "pressure",
     "pressure_rod": "pressure",
     "pressure_supply": "pressure",
+    "velocity": "velocity",
 }
 
 
@@ -618,13 +620,22 @@ def find_channel_sensor(machine: Machine, sensors: SensorSet | None, channel: st
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")
-    of_kind: Sensor = getattr(sensors, _SENSOR_KIND_OF_CHANNEL[kind])
+    of_kind: Sensor = getattr(sensors, _SENSOR_KIND_OF_CHANNEL[kind]) or Sensor()
     sensor = sensors.channels.get(channel, of_kind)
     if kind == "length" and sensor.bits and sensor.span is None:
         cylinder = machine.axes[axis].cylinder
         assert cylinder
         return sensor.model_copy(update={"span": cylinder.stroke})
     return sensor
+
+
+def rate_channels(machine: Machine) -> tuple[str, ...]:
+    """Return the channels `velocity.AXIS` that a sensor set of a machine measures, in the order of its axes.
+
+    Rates that no sensor measures, such as differences of positions, contain no information of their own.
+    """
+    channels = (f"velocity.{axis}" for axis in machine.axes)
+    return tuple(c for c in channels if any(s.velocity or c in s.channels for s in machine.sensors.values()))
 
 
 def reading_noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:

@@ -25,15 +25,21 @@ class Sensor(StrictModel):
     The error is uniform in +-`accuracy`, or normal with `standard_deviation`. Without either, the
     simulator treats the sensor as ideal, and identification treats its noise as unknown. `bits` and
     `span` are None for a sensor without converter steps.
+
+    The errors of two readings at a distance t have the correlation exp(-t / `correlation_time`) [s].
+    `gap` and `identify` then use one reading per correlation time, so that the errors are independent.
     """
 
     accuracy: NonNegativeFloat = 0.0
     standard_deviation: NonNegativeFloat = 0.0
     bits: Annotated[int, Field(ge=1, le=32)] | None = None
     span: PositiveFloat | None = None
+    correlation_time: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _check(self):
+        if self.correlation_time and not self.standard_deviation:
+            raise ValueError("correlation_time needs standard_deviation: only normal errors can be correlated")
         if self.accuracy and self.standard_deviation:
             raise ValueError("give accuracy (the bound of a uniform error) or standard_deviation, not both")
         return self
@@ -110,7 +116,8 @@ class SensorSet(StrictModel):
 
     The sampling instants of the rows have a normally distributed error with standard deviation
     `jitter` [s], common to all channels. An entry of `channels`, such as `pressure_head.boom`,
-    replaces the sensor of its kind; an empty entry means an unknown accuracy.
+    replaces the sensor of its kind; an empty entry means an unknown accuracy. `velocity` measures
+    the rates of the joints, as gyros do.
     """
 
     rate: PositiveFloat = 50.0
@@ -119,6 +126,7 @@ class SensorSet(StrictModel):
     position: Sensor = Sensor()
     length: Sensor = Sensor()
     pressure: Sensor = Sensor()
+    velocity: Sensor | None = None
     channels: dict[str, Sensor] = {}
     absent: tuple[Literal["angle", "position", "length", "pressure"], ...] = ()
     mounted: dict[Name, MountedSensor] = {}

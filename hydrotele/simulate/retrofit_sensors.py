@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hydrotele.machine.machine import find_channel_sensor, rate_channels
 from hydrotele.machine.sensors import MountedSensor, Sensor, SensorSet, make_channel_converter
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import Record
@@ -70,7 +71,7 @@ def simulate_retrofit_readings(
         (channel -> (n,) readings in SI, channel -> unit).
     """
     period = float(record.time[1] - record.time[0]) if len(record.time) > 1 else 0.0
-    readings, units = _simulate_scalar_readings(plant, sensors, truth, len(record.time), seed)
+    readings, units = _simulate_scalar_readings(plant, sensors, truth, len(record.time), seed, period)
     names = list(dict.fromkeys(sensor.link for sensor in sensors.mounted.values()))
     if names:
         motion = compute_link_motion(plant.model, record, [plant.model.body(name).id for name in names])
@@ -79,7 +80,7 @@ def simulate_retrofit_readings(
         values = mounted_sensor_values(sensor, motion.rate[:, k], motion.acceleration[:, k], motion.force[:, k], period)
         for channel in sensor.channels(name):
             noise = Sensor(standard_deviation=sensor.noise(channel))
-            values_of = _add_random_error(noise, channel, values[channel.partition(".")[0]], seed)
+            values_of = _add_random_error(noise, channel, values[channel.partition(".")[0]], seed, period)
             readings[channel] = _hold_readings(values_of, sensor.rate, period)
             units[channel] = "rad/s" if channel.startswith("gyro") else "rad"
             if channel.startswith("accelerometer"):
@@ -120,9 +121,16 @@ def mounted_sensor_values(
     return values
 
 
-def _simulate_scalar_readings(plant: Plant, sensors: SensorSet, truth: dict[str, np.ndarray], rows: int, seed: int):
-    """Return the readings of flows, load-sensing pressure and pilot pressures, and their units."""
+def _simulate_scalar_readings(
+    plant: Plant, sensors: SensorSet, truth: dict[str, np.ndarray], rows: int, seed: int, period: float
+):
+    """Return the readings of joint rates, flows, load-sensing pressure and pilot pressures, and their units."""
     valves, values = plant.machine.valve_axes, {}
+    for channel in rate_channels(plant.machine):
+        if sensors.velocity or channel in sensors.channels:
+            sensor, axis = find_channel_sensor(plant.machine, sensors, channel), channel.partition(".")[2]
+            unit = "rad/s" if plant.machine.position_kind(axis) == "angle" else "m/s"
+            values[channel] = sensor, truth[f"truth.{channel}"], unit
     if sensors.flow:
         for axis in valves:
             values[f"flow.{axis}"] = sensors.flow, truth[f"truth.flow_head.{axis}"], "m^3/s"
@@ -143,14 +151,14 @@ def _simulate_scalar_readings(plant: Plant, sensors: SensorSet, truth: dict[str,
     if sensors.oil_temperature and plant.machine.oil:
         temperature = np.full(rows, plant.machine.oil.temperature)
         values["oil_temperature"] = sensors.oil_temperature, temperature, "degC"
-    readings = {channel: _add_random_error(s, channel, v, seed) for channel, (s, v, _) in values.items()}
+    readings = {channel: _add_random_error(s, channel, v, seed, period) for channel, (s, v, _) in values.items()}
     return readings, {channel: unit for channel, (_, _, unit) in values.items()}
 
 
-def _add_random_error(sensor: Sensor, channel: str, values: np.ndarray, seed: int) -> np.ndarray:
+def _add_random_error(sensor: Sensor, channel: str, values: np.ndarray, seed: int, period: float) -> np.ndarray:
     if not (sensor.error_rms or sensor.bits):
         return values
-    errors = sample_sensor_errors(sensor, seed, channel, len(values))
+    errors = sample_sensor_errors(sensor, seed, channel, len(values), period)
     return quantise_readings(values + errors, *make_channel_converter(sensor, channel))
 
 

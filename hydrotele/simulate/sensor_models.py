@@ -21,7 +21,9 @@ from hydrotele.simulate.record import sensed_channels
 from hydrotele.simulate.stepping import Stepper, apply_sensor_delays, true_sensor_values
 
 
-def sample_sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
+def sample_sensor_errors(
+    sensor: Sensor, seed: int, channel: str, count: int, period: float = 0.0
+) -> np.ndarray:  # fmt: skip
     """Sample the random errors of a sensor channel for a whole run, reproducibly from the seed.
 
     Args:
@@ -29,6 +31,7 @@ def sample_sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) ->
         seed: the scenario's seed.
         channel: channel name, which selects the random stream.
         count: number of samples n.
+        period: time between samples [s], for correlated errors.
 
     Returns:
         (n,) errors, uniform in [-accuracy, accuracy], or normal if there is a standard deviation.
@@ -37,7 +40,14 @@ def sample_sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) ->
     """
     stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(channel.encode())]))
     if sensor.standard_deviation:
-        return stream.normal(0.0, sensor.standard_deviation, count)
+        errors = stream.normal(0.0, sensor.standard_deviation, count)
+        if sensor.correlation_time and count:
+            from scipy.signal import lfilter  # starts slowly
+
+            kept = np.exp(-period / sensor.correlation_time)
+            errors[1:] *= np.sqrt(1.0 - kept**2)
+            errors = lfilter([1.0], [1.0, -kept], errors)
+        return errors
     return stream.uniform(-1.0, 1.0, count) * sensor.accuracy
 
 
@@ -149,7 +159,7 @@ def simulate_readings(
         if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
             if error is None:
-                error = sample_sensor_errors(sensor, seed, channel, len(values))
+                error = sample_sensor_errors(sensor, seed, channel, len(values), period)
             values = quantise_readings(values + error, *make_channel_converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
@@ -339,7 +349,7 @@ def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: i
     names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (supplies if plant.hydraulic else 0)]
     kinds = {name: find_channel_sensor(plant.machine, sensors, name) for name in names}
     count = ticks // every + 1  # including the unused sample after the last tick
-    errors = {name: sample_sensor_errors(kinds[name], seed, name, count) for name in names}
+    errors = {name: sample_sensor_errors(kinds[name], seed, name, count, every / control_rate) for name in names}
     defects = [plant.machine.sensor_errors.get(name, SensorError()) for name in names]
     time = every / control_rate * np.arange(count)
     changes = [d.offset_at(time) - d.offset for d in defects]

@@ -1,13 +1,14 @@
 """Measure which fraction of contact time and of free time is detected as contact in simulated digging logs.
 
     python tools/validation/contact.py --seeds 11 12 13 14 [--out docs/validation/contact.md]
-        [--keep FOLDER] [--friction]
+        [--keep FOLDER]
+    python tools/validation/contact.py --seeds --friction 301 302 303
 
 Each seed simulates one log of a CAT 215 with a bucket: free motion, two digging cycles, the full
 bucket carried and emptied. Soil, poses, durations and sensor noise are random. The simulated machine
 differs from the model in all parameters, by their stated standard deviations. True contact is
-a simulated force between ground and machine. `--friction` also runs `gap` on logs of a machine with
-a hidden friction, with and without the mask.
+a simulated force between ground and machine. `--friction` runs `gap` on two logs of a machine with
+a hidden Coulomb friction of random size on a random cylinder, with and without the mask.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import numpy as np
 from hydrotele.control.contact import Contact, contact_masks, detect_contact, find_contact_rows
 from hydrotele.estimate.hypothesis import calibration
 from hydrotele.gap.find import find_gap
+from hydrotele.gap.result import Method
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.logs.masked_intervals import MaskedInterval, find_unmasked_rows
@@ -33,7 +35,7 @@ from hydrotele.scenario.scenario import Scenario
 from hydrotele.soil.parameters import SOILS
 
 SENSORS = "khoshzaban1992"
-FRICTION = ("stick", 6.0e3)  # axis and additional Coulomb friction [N] of the hidden effect
+FRICTION = (3.0e3, 9.0e3)  # range of the additional Coulomb friction [N] of the hidden effect
 FREE_MOTION = (8, 4.0)  # number and duration [s] of the moves of these logs
 LIGHT_CONTACT = 1.0e3  # [N] contact with a larger force is also reported separately
 LIGHT_LOAD = 100.0  # [kg] a smaller load does not count as a load
@@ -130,21 +132,26 @@ def score(found: Contact, truth: Log) -> Score:
     return Score(*(float(rows.sum()) / truth.rate for part, found in parts for rows in (part, part & found)))
 
 
-def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
+def friction_trial(seed: int, nominal: Machine, keep: Path | None, method: Method) -> None:
     """Print what `gap` finds in digging logs of a machine with a hidden friction, with and without the mask."""
-    axis, more = FRICTION
+    rng = np.random.default_rng(seed)
+    axis, more = str(rng.choice([n for n, a in nominal.axes.items() if a.cylinder])), rng.uniform(*FRICTION)
     friction = nominal.axes[axis].drive.friction.coulomb
     hidden = nominal.replace(f"axes.{axis}.cylinder.friction.coulomb", friction + more)
     logs = [simulate(seed + 100 * k, hidden, f"dig_{k}", FREE_MOTION)[0] for k in range(2)]
     files = [RunFiles(f"dig_{k}", (dataclasses.replace(log, source=f"dig_{k}"),)) for k, log in enumerate(logs)]
     if keep:
         for k, log in enumerate(logs):
-            save_log(log, keep / f"friction_{k}.parquet")
+            save_log(log, keep / f"friction_{seed}_{k}.parquet")
     found = detect_contact(files, nominal)
     for name, masks in (("mask", contact_masks(found, files)), ("ignore", ())):
-        gap = find_gap(make_dataset(files, nominal, masks=masks))
-        named = ", ".join(f"{e.name} at {e.location} ({e.probability:.2f})" for e in gap.effects) or "none"
-        print(f"| {name} | {gap.verdict} | {named} |", flush=True)
+        gap = find_gap(make_dataset(files, nominal, masks=masks), method=method)
+        named = ", ".join(
+            f"{e.name} at {e.location} ({e.probability:.2f}) "
+            + " ".join(f"{key} {p.value:.4g} [{p.low:.4g}, {p.high:.4g}]" for key, p in e.parameters.items())
+            for e in gap.effects
+        )
+        print(f"| {seed} | {axis} {friction + more:.0f} N | {name} | {gap.verdict} | {named or 'none'} |", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -153,7 +160,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[11, 12, 13, 14])
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--keep", type=Path, help="existing folder for the logs")
-    parser.add_argument("--friction", type=int, help="seed of a gap run with a hidden friction")
+    parser.add_argument("--friction", type=int, nargs="*", default=[], help="seeds of gap runs with a hidden friction")
+    parser.add_argument("--method", choices=("search", "regression"), default="regression", help="of these gap runs")
     chosen = parser.parse_args(arguments)
     nominal, total, rows = load_machine("cat215", "bucket"), None, []
     print("| seed | contact [s] | found [%] | found above 1 kN [%] | free [s] | found as contact [%]"
@@ -171,8 +179,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             save_log(truth, chosen.keep / f"truth_{seed}.parquet")
     if total:
         print(total.row("all"))
-    if chosen.friction is not None:
-        friction_trial(chosen.friction, nominal, chosen.keep)
+    for seed in chosen.friction:
+        friction_trial(seed, nominal, chosen.keep, chosen.method)
     if chosen.out and total:
         chosen.out.write_text(json.dumps(dataclasses.asdict(total)))
 
