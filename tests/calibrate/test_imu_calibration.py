@@ -73,6 +73,11 @@ def test_joint_angles_and_mounting_are_recovered(tmp_path):
     assert np.all(np.abs(error).max(axis=1) < 5.0 * np.hypot(run.noise, run.offset))
     assert np.all(run.residual_rms < 1.1)  # the motion is smooth, so that only noise remains
     assert set(result.logs[0].columns) > {"angle.swing", "angle.boom", "velocity.stick"}
+    time, rates = result.logs[0].time, np.array([result.logs[0][f"velocity.{a}"] for a in POSITIONS])
+    sensors = result.machine.sensors["imu"].channels
+    stated = [sensors[f"velocity.{a}"].standard_deviation for a in POSITIONS]
+    np.testing.assert_allclose(np.std(rates - joint_motion(time)[1], axis=1), stated, rtol=0.1)  # 2000 readings
+    assert all(sensors[f"angle.{a}"].correlation_time > 1.0 for a in POSITIONS)  # smoothed over seconds
 
 
 def test_offset_of_a_joint_needs_a_pose(tmp_path):

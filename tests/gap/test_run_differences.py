@@ -1,5 +1,6 @@
 """Parameters that differ between runs, forces that act in one run, and the held-out run compared with the others."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -92,6 +93,16 @@ def test_friction_that_differs_between_runs_is_found_and_transfers_to_another_ru
     assert np.std(sampled) > 0.8 * difference.deviation  # samples hold for a new run; of 200, truncated at 0
     (document,) = gap_document(gap)["run_differences"]
     assert document["name"] == _VISCOUS
+
+
+def test_an_effect_that_the_fitted_run_does_not_show_is_named_from_the_held_out_run():
+    rig = load_machine("rig")
+    rough = rig.replace("axes.slide.cylinder.friction.viscous", 1.5 * rig.axes["slide"].cylinder.friction.viscous)
+    data = _simulate([rough, rough])
+    data = dataclasses.replace(data, fit=(data.fit[0].select_rows(0, 30),))  # 0.15 s
+    gap = find_gap(data, effects=("viscous_friction",), jobs=1, method="regression")
+    assert [(e.name, e.location) for e in gap.effects] == [("viscous_friction", "slide")]
+    assert any("run_1 is held out in place of run_0" in note for note in gap.notes)
 
 
 def test_a_pulse_in_one_run_is_named_and_one_in_the_held_out_run_is_reported(tmp_path):

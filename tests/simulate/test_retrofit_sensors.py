@@ -4,16 +4,19 @@ import numpy as np
 import pytest
 
 from hydrotele.calibrate.imu_model import build_imu_chain, predict_imu_readings
-from hydrotele.machine.machine_file import load_machine
+from hydrotele.logs.dataset import make_dataset
+from hydrotele.logs.run_files import RunFiles
+from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.machine.oil import Oil, kinematic_viscosity
 from hydrotele.machine.oil_temperature import with_oil_temperature
-from hydrotele.machine.sensors import MountedSensor
+from hydrotele.machine.sensors import MountedSensor, Sensor, SensorSet
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.pilots import ConstantPilot
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant
 from hydrotele.simulate.record import Record
 from hydrotele.simulate.retrofit_sensors import compute_link_motion, mounted_sensor_values
+from hydrotele.simulate.sensor_models import sample_sensor_errors
 
 
 def test_imu_readings_of_mujoco_agree_with_the_chain_model():
@@ -107,3 +110,30 @@ def test_viscosity_follows_walther_and_is_reversible():
     assert warm.axes["boom"].hydraulic_drive.leakage == pytest.approx(2e-12 / ratio)
     back = with_oil_temperature(warm, 40.0)
     assert back.axes["boom"].hydraulic_drive.friction.viscous == pytest.approx(6000.0)
+
+
+def test_joint_rates_and_correlated_errors_are_logged_and_used(tmp_path):
+    sensors = {"velocity": {"standard_deviation": 2e-3}, "absent": ["length"], "pressure": {"accuracy_bar": 1.0},
+               "angle": {"standard_deviation": 1e-3, "correlation_time": 0.5}}  # fmt: skip
+    machine = load_machine("cat215").replace("sensors", {"site": SensorSet.model_validate(sensors)})
+    save_machine(machine, tmp_path / "machine.yaml")
+    pilot = {"kind": "constant", "commands": {"boom": 0.4}}
+    scenario = {"name": "lift", "machine": str(tmp_path), "duration": 8.0, "control_rate": 50.0, "pilot": pilot}
+    logs = []
+    for seed in (1, 2):
+        run = run_scenario(Scenario.model_validate({**scenario, "seed": seed, "sensors": "site"}))
+        logs.append(RunFiles(f"lift_{seed}", (run.measured,)))
+        error = run.measured["velocity.boom"] - run.truth["truth.velocity.boom"]
+        assert np.std(error) == pytest.approx(2e-3, rel=0.15)  # 400 readings: 3.5 % is one standard deviation
+    data = make_dataset(logs, machine)
+    count = np.isfinite(data.fit[0].reading).sum(axis=0)
+    assert "velocity.boom" in data.channels and count[data.channels.index("velocity.boom")] == len(data.fit[0].reading)
+    assert count[data.channels.index("angle.boom")] == pytest.approx(8.0 / 0.5, abs=1)
+
+
+def test_correlated_errors_have_the_stated_correlation():
+    sensor = Sensor(standard_deviation=2.0, correlation_time=0.4)
+    errors = sample_sensor_errors(sensor, 3, "angle.boom", 200_000, 0.02)
+    assert np.std(errors) == pytest.approx(2.0, rel=0.03)  # 5 000 independent errors: 1 % is one standard deviation
+    later = np.mean(errors[20:] * errors[:-20]) / np.var(errors)
+    assert later == pytest.approx(np.exp(-1.0), abs=0.04)
