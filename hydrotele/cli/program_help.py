@@ -38,6 +38,7 @@ COMMAND_GROUPS = {
     },
     "Analyse": {
         "analyse": "Analyse a teleoperator by linear two-port theory.",
+        "linearise": "Compute linear state-space models of a machine at poses; list natural frequencies and damping.",
         "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
     },
     "Models and files": {
