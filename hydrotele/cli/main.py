@@ -28,6 +28,7 @@ from hydrotele.cli.option_values import (
     parse_positive_numbers,
 )
 from hydrotele.cli.program_help import DESCRIPTION, format_program_help
+from hydrotele.cli.serve_command import SERVE_EPILOG, serve
 from hydrotele.core.errors import InputError
 
 
@@ -289,6 +290,7 @@ def run(
 
 app.command(epilog=DRIVE_EPILOG)(drive)
 app.command("haptic-device", epilog=HAPTIC_EPILOG)(haptic_device)
+app.command(epilog=SERVE_EPILOG)(serve)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
 app.command(epilog=LINEARISE_EPILOG)(linearise)

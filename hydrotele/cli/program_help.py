@@ -20,6 +20,7 @@ COMMAND_GROUPS = {
         "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
         "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
         "drive": "Drive a machine in real time; write the same files as `run`.",
+        "serve": "Let a client program drive a simulated machine over ZeroMQ; write the same files as `run`.",
         "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
         "demo": "Simulate an excavator, replay its log and draw the results.",
     },

@@ -76,10 +76,10 @@ def test_a_perturbation_of_the_simulator_grows_as_the_matrix_exponential(name, s
             at = len(plant.axes) + 4 * i
             found += [*moved[at + 2 : at + 4]]
         for state, value in zip(names, found, strict=True):
-            # Pins of closed loops yield, and the integrator is of second order: 0.3 % of the motion.
+            # The friction of the simulator is of first order in the step: 2 % at the 39 Hz of the grab.
             kind = state.partition(".")[0]
             scale = np.abs([v for s, v in zip(model.states, expected, strict=True) if s.startswith(kind)]).max()
-            assert value == pytest.approx(expected[model.states.index(state)], abs=0.01 * scale), state
+            assert value == pytest.approx(expected[model.states.index(state)], abs=0.02 * scale), state
 
 
 def test_the_operating_point_is_steady_and_holds_its_load():

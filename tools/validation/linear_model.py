@@ -112,7 +112,7 @@ def compare(machine: Machine, model: LinearModel, axis: str, settle: float, wher
 
 machine = load_machine(arguments.machine, arguments.tool)
 valves = list(machine.valve_axes)
-smooth = remove_dry_friction(machine, valves)
+smooth = remove_dry_friction(machine, list(machine.axes))
 print("| pose | axis | output | median error [%] | largest error [%] | at [Hz] | peak at [Hz] |")
 print("| --- | --- | --- | ---: | ---: | ---: | ---: |")
 for text in arguments.pose or [""]:
