@@ -16,7 +16,7 @@ Examples:  hydrotele serve hold --duration 60
 
 \b
 Clients send msgpack maps over ZeroMQ; docs/live.md describes the protocol and has a client in
-Python. In lockstep (the default) the machine moves only while a client asks for it. The run starts
+Python. In lockstep (the default) the machine moves only while a client requests it. The run starts
 with the first step, and ends with its duration, a client's stop, or Ctrl-C. There is no
 authentication: listen on addresses other than 127.0.0.1 only in a private network.
 """

@@ -161,7 +161,7 @@ class LinearModel:
         spool rate have more than half of the sum.
         """
         scale = _balance(self.states)
-        poles, left, right = eig((self.a * scale) / scale[:, None], left=True)
+        poles, left, right = eig((self.a * scale) / scale[:, None], left=True)  # pyright: ignore[reportAssignmentType]
         owners = [name.partition(".")[2] for name in self.states]
         spools = np.array([name.startswith("spool") for name in self.states])
         modes = []
@@ -517,8 +517,8 @@ def _hydraulic_force(axis: Axis, activations: np.ndarray) -> float:
 def _guess_open_valve(machine: Machine, name: str, velocity: float, activations: np.ndarray) -> None:
     """Replace the activations of an axis at rest by an estimate of those at a velocity, in place.
 
-    The force stays the same. The flows into both chambers make up for the motion of the piston and
-    for its leakage; the edges of the valve are equal, and the supply is at its maximum pressure.
+    The force stays the same. The flows into both chambers balance the motion of the piston and its
+    leakage; the edges of the valve are equal, and the supply is at its maximum pressure.
     """
     axis, force = machine.axes[name], _hydraulic_force(machine.axes[name], activations)
     drive, valve = axis.hydraulic_drive, axis.valve

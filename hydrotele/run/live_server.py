@@ -2,10 +2,10 @@
 
 Every request and reply is one message with a msgpack map. A ROUTER socket takes requests of REQ and
 DEALER clients; docs/live.md describes the protocol. In lockstep the machine moves only while a
-client asks for it. In real time it moves at the rate of the wall clock, and a request for a step is
+client requests it. In real time it moves at the rate of the wall clock, and a request for a step is
 answered after the next control tick.
 
-One client drives: the first that asks for a step. It is released when it says so, or when it is
+One client drives: the first that requests a step. It is released by its request, or when it is
 silent for longer than the timeout; all commands are then 0. Other clients can read the state.
 A request that is not valid is answered with an error and changes nothing.
 """
@@ -18,8 +18,7 @@ import numpy as np
 
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.timing import summarise_durations
-from hydrotele.run.interactive_run import Pacer
+from hydrotele.haptics.timing import RealTimePacer, read_load_averages, summarise_durations
 from hydrotele.run.run import Run, finish_run, start_session
 from hydrotele.run.session import Session
 from hydrotele.scenario.pilots import ConstantPilot, TablePilot
@@ -33,6 +32,7 @@ MAX_FRAME_BYTES = 65536  # ZeroMQ closes the connection of a client that sends a
 MAX_TICKS = 1000  # control ticks of one request in lockstep
 _POLL_MS = 100  # ms between two checks for Ctrl-C while no message comes
 _MAX_REQUESTS_AT_ONCE = 100  # that are answered before the next control tick
+_PRIORITY = 20  # real-time priority in real time, where the system permits it
 _GRACE_TIME = 0.5  # s after the end in which late requests get the last state
 _LINGER_MS = 500  # ms to deliver the last replies
 _REQUESTS = ("describe", "read", "step", "release", "stop")
@@ -77,7 +77,7 @@ class LiveServer:
         requests: number of requests so far.
         errors: number of requests that were answered with an error.
         is_stopped: whether a client has stopped the run.
-        has_started: whether a client has asked for a step.
+        has_started: whether a client has requested a step.
     """
 
     def __init__(self, session: Session, options: LiveOptions) -> None:
@@ -288,7 +288,7 @@ def serve_scenario(
 ) -> Run:  # fmt: skip
     """Run a scenario with the commands of clients, until its end, a request to stop, or an interrupt.
 
-    The pilot of the scenario is not used. The run starts with the first step that a client asks for.
+    The pilot of the scenario is not used. The run starts with the first step that a client requests.
 
     Args:
         scenario: the scenario; its duration is the maximum duration of the run.
@@ -308,7 +308,7 @@ def serve_scenario(
     scenario = scenario.model_copy(update={"pilot": ConstantPilot(kind="constant")})
     session = start_session(scenario)
     server = LiveServer(session, options)
-    pacer, starts = Pacer(1.0, sleep=server.serve_for), np.zeros(scenario.tick_count + 1)
+    pacer = RealTimePacer(scenario.tick_count, _PRIORITY, sleep=server.serve_for)
     mode = "real time" if options.is_realtime else "lockstep"
     say(f"{scenario.name}, {mode}, listens on tcp://{options.host}:{server.port}")
     try:
@@ -316,11 +316,9 @@ def serve_scenario(
             if not (options.is_realtime and server.has_started):
                 server.serve_for(1e-3 * _POLL_MS)
                 continue
-            pacer.wait_for_tick(session.time)
-            server.answer_pending_requests()
-            starts[session.tick] = clock.perf_counter()
             server.advance(1)
             server.send_waiting_replies()
+            pacer.wait_for_tick(session.time)  # starts after the first tick, which loads compiled code
         server.serve_for(_GRACE_TIME)
         while session.tick % session.ticks_per_row:  # the logs hold whole rows
             server.advance(1)
@@ -328,16 +326,17 @@ def serve_scenario(
         server.send_waiting_replies("the simulation is unstable; the run has ended")
         raise
     finally:
+        pacer.close()
         server.send_waiting_replies()
         server.close()
     run = finish_run(session, _recorded_scenario(scenario, session))
-    run.summary["live"] = {
-        "mode": mode, "requests": server.requests, "errors": server.errors, "pauses": pacer.pauses,
-        "paused_seconds": round(pacer.total_delay, 3),
-    }  # fmt: skip
+    run.summary["live"] = {"mode": mode, "requests": server.requests, "errors": server.errors}
     if options.is_realtime:
-        intervals = np.diff(starts[: session.tick])
-        run.summary["live"]["tick_interval"] = summarise_durations(1e9 * intervals[intervals > 0.0])
+        run.summary["live"] |= {
+            "ticks": pacer.ticks, "missed": pacer.missed, "lateness": summarise_durations(pacer.delays()),
+            "pauses": pacer.pauses, "paused_seconds": round(pacer.total_delay, 3), "priority": pacer.priority,
+            "load": read_load_averages(),
+        }  # fmt: skip
     return run
 
 

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.linear_model import linearise, remove_dry_friction
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.plant import build_plant, initial_state
+from hydrotele.simulate.plant import build_plant, initial_state, rest_state
 from hydrotele.simulate.record import align_staggered_positions, start_leapfrog
 
 POSE = {"boom": 0.45, "stick": -1.6}
@@ -17,11 +17,12 @@ POSE = {"boom": 0.45, "stick": -1.6}
 def test_natural_frequency_of_a_cylinder_with_a_mass_is_that_of_merritt():
     """w^2 = beta (A_h^2 / V_h + A_r^2 / V_r) / m, Merritt 1967, section 6-1; one cylinder on a slide."""
     machine = load_machine("rig")
-    cylinder, beta = machine.axes["slide"].cylinder, machine.supply.bulk_modulus
+    cylinder = machine.axes["slide"].cylinder
+    assert cylinder and machine.supply
     model = linearise(machine)
     x = model.operating_output[model.outputs.index("length.slide")]
     head, rod = cylinder.chamber_volumes(np.array(x))
-    stiffness = beta * (cylinder.area_head**2 / head + cylinder.area_rod**2 / rod)
+    stiffness = machine.supply.bulk_modulus * (cylinder.area_head**2 / head + cylinder.area_rod**2 / rod)
     row = model.states.index("rate.slide")
     mass = 1.0 / model.b[row, model.inputs.index("force.slide")]
     (mode,) = model.oscillations
@@ -34,6 +35,7 @@ def test_the_spool_is_the_second_order_system_of_the_machine_file():
     machine = load_machine("cat215")
     model = linearise(machine, POSE)
     valve = machine.axes["boom"].valve
+    assert valve
     place, rate = (model.states.index(name) for name in ("spool.boom", "spool_rate.boom"))
     w = valve.bandwidth
     found = model.a[rate, place], model.a[rate, rate], model.b[rate, model.inputs.index("command.boom")]
@@ -82,12 +84,22 @@ def test_a_perturbation_of_the_simulator_grows_as_the_matrix_exponential(name, s
             assert value == pytest.approx(expected[model.states.index(state)], abs=0.02 * scale), state
 
 
+def test_at_speed_0_the_pressures_are_those_of_the_simulator_at_rest():
+    machine = load_machine("cat215", "bucket")
+    model, plant = linearise(machine, POSE), build_plant(machine)
+    rest = plant.pressures(rest_state(plant, POSE))
+    for (head, rod), axis in zip(rest, plant.axes, strict=True):
+        found = [model.operating_state[model.states.index(f"pressure_{side}.{axis}")] for side in ("head", "rod")]
+        assert np.allclose(found, (head, rod), rtol=1e-3)  # pins of closed loops yield in the simulator
+
+
 def test_the_operating_point_is_steady_and_holds_its_load():
     machine = load_machine("cat215", "bucket")
     model = linearise(machine, speed={"boom": 0.05})
     z = dict(zip(model.states, model.operating_state, strict=True))
     assert z["rate.boom"] == 0.05 and z["rate.stick"] == 0.0
-    assert z["spool.boom"] > machine.axes["boom"].valve.deadband  # it lifts
+    valve = machine.axes["boom"].valve
+    assert valve and z["spool.boom"] > valve.deadband  # it lifts
     assert z["spool.stick"] == 0.0
     command = model.operating_input[model.inputs.index("command.boom")]
     assert command == pytest.approx(z["spool.boom"], abs=1e-9)
@@ -101,8 +113,9 @@ def test_frequency_response_is_that_of_the_state_space_and_has_the_delay_of_the_
     names = ["command.slide"], ["velocity.slide"]
     found = prompt.frequency_response(frequencies, *names)[:, 0, 0]
     plain = prompt.state_space(*names)
+    a, b, c = (np.array(getattr(plain, name)) for name in "ABC")
     for f, value in zip(frequencies, found, strict=True):
-        expected = plain.C @ np.linalg.solve(2j * np.pi * f * np.eye(len(plain.A)) - plain.A, plain.B)
+        expected = c @ np.linalg.solve(2j * np.pi * f * np.eye(len(a)) - a, b)
         assert value == pytest.approx(expected[0, 0], rel=1e-6)
     shifted = delayed.frequency_response(frequencies, *names)[:, 0, 0]
     assert np.allclose(shifted, found * np.exp(-2j * np.pi * frequencies * 0.05), rtol=1e-9)

@@ -118,7 +118,7 @@ def test_wrong_requests_are_answered_with_an_error_and_change_nothing():
     assert client.ask(do="read") == before
     rng = np.random.default_rng(0)
     for _ in range(300):
-        assert "error" in client.send(rng.bytes(rng.integers(1, 60)))
+        assert "error" in client.send(rng.bytes(int(rng.integers(1, 60))))
     assert client.ask(do="read") == before
     client.ask(do="step", command={"boom": 0.1}, ticks=1000)
     assert server.finish().summary["live"]["errors"] == len(WRONG) + 300
@@ -179,7 +179,7 @@ def test_in_real_time_a_silent_client_is_replaced_by_zero_commands():
     run = server.finish()  # it goes on without the client
     assert len(run.truth.time) == 30
     assert run.truth["command.boom"][-1] == 0.0 and run.truth["command.boom"][1] == 0.5
-    assert run.summary["live"]["tick_interval"]["count"] > 100
+    assert run.summary["live"]["ticks"] == 120
     client.close()
 
 
