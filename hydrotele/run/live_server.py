@@ -141,6 +141,8 @@ class LiveServer:
 
     def send_waiting_replies(self, error: str | None = None) -> None:
         """Answer the clients that wait for the end of a control tick, with the state or an error."""
+        if self._waiting:
+            self._last_request = clock.perf_counter()  # silence starts with the reply
         for envelope in self._waiting:
             self._send(envelope, {"error": error} if error else self._state())
         self._waiting = []

@@ -166,7 +166,7 @@ def test_one_client_drives_and_another_takes_over_when_it_is_gone():
 
 
 def test_in_real_time_a_silent_client_is_replaced_by_zero_commands():
-    server = Server(0.6, LiveOptions(is_realtime=True, port=0, timeout=0.1))
+    server = Server(2.0, LiveOptions(is_realtime=True, port=0, timeout=0.5))
     client = Client(server)
     assert "one control tick" in client.ask(do="step", ticks=2)["error"]
     state = client.ask(do="read")
@@ -177,9 +177,9 @@ def test_in_real_time_a_silent_client_is_replaced_by_zero_commands():
         ticks.append(state["tick"])
     assert ticks[0] == 1 and np.diff(ticks).min() >= 1
     run = server.finish()  # it goes on without the client
-    assert len(run.truth.time) == 30
-    assert run.truth["command.boom"][-1] == 0.0 and run.truth["command.boom"][1] == 0.5
-    assert run.summary["live"]["ticks"] == 120
+    assert len(run.truth.time) == 100
+    assert run.truth["command.boom"].max() == 0.5 and run.truth["command.boom"][-1] == 0.0
+    assert run.summary["live"]["ticks"] == 400
     client.close()
 
 
@@ -222,3 +222,4 @@ def test_the_client_of_the_page_lifts_the_boom(is_realtime):
     # The valve's dead band of 0.04 leaves an error of 0.04 / 3 rad; the pump and the spool need 1 s.
     assert run.measured["angle.boom"][-1] - run.measured["angle.boom"][0] == pytest.approx(0.2, abs=0.03)
     values["socket"].close()
+    values["socket"].context.term()
