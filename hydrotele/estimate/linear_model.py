@@ -371,13 +371,17 @@ def _find_operating_point(
     for name, axis in machine.axes.items():
         if f"rate.{axis.joint}" in step.states:
             state[step.states.index(f"rate.{axis.joint}")] = speeds[name]
-        if f"drive.{name}" in step.states:
-            state[step.states.index(f"drive.{name}")] = step.load_position(state, name)
-            state[step.states.index(f"drive_rate.{name}")] = step.load_velocity(state, name)
+    for name, axis in machine.axes.items():
+        if axis.transmission:  # its drive side leads by the backlash
+            velocity = step.load_velocity(state, name)
+            ahead = math.copysign(_BACKLASH_SHARE * axis.transmission.backlash, velocity)
+            state[step.states.index(f"drive.{name}")] = step.load_position(state, name) + ahead
+            state[step.states.index(f"drive_rate.{name}")] = velocity
     loose = [k for k, name in enumerate(step.joints) if name not in driven]
     loose += [*range(len(step.joints), total), *range(2 * total + ACTIVATIONS_PER_AXIS * len(hydraulic), len(state))]
     steered = [i for i, name in enumerate(step.order) if machine.axes[name].force]
     balanced = [*range(total, 2 * total), *range(2 * total + ACTIVATIONS_PER_AXIS * len(hydraulic), len(state))]
+    pumps = [k for k, name in enumerate(step.states) if name.startswith("delivery.")]
     first = {name: 2 * total + ACTIVATIONS_PER_AXIS * i for i, name in enumerate(hydraulic)}
 
     def solve(held: Sequence[str], moving: Sequence[str]) -> float:
@@ -398,6 +402,7 @@ def _find_operating_point(
             unpack(x)
             return step.rates(state, command)[rows] / sizes
 
+        state[pumps] = 1.0  # of the full flow: Newton's method starts with enough supply pressure
         known = [_hydraulic_force(machine.axes[name], state[first[name] :]) for name in held]
         x = np.concatenate([state[places], command[commands], known]) / scale
         x = _solve_newton(residual, x)
@@ -546,6 +551,7 @@ def _guess_open_valve(machine: Machine, name: str, velocity: float, activations:
 
 
 _GUESS_ITERATIONS = 5
+_BACKLASH_SHARE = 0.51  # of the backlash, by which a drive side leads at first: contact, and not in the gap
 _MAX_NEWTON_STEPS, _MAX_HALVINGS = 50, 12
 _NEWTON_PERTURBATION = 1.0e-5  # of an unknown, relative to its value
 _MIN_DROP = 1.0e4  # Pa, over an edge of an open valve

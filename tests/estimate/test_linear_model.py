@@ -6,6 +6,7 @@ import pytest
 from scipy.linalg import expm
 
 from hydrotele.core.errors import InputError
+from hydrotele.effects import apply_effect
 from hydrotele.estimate.linear_model import linearise, remove_dry_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
@@ -119,6 +120,24 @@ def test_frequency_response_is_that_of_the_state_space_and_has_the_delay_of_the_
         assert value == pytest.approx(expected[0, 0], rel=1e-6)
     shifted = delayed.frequency_response(frequencies, *names)[:, 0, 0]
     assert np.allclose(shifted, found * np.exp(-2j * np.pi * frequencies * 0.05), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "state"),
+    [
+        (("joint_flexibility", "boom", {"compliance": 2e-8}), "drive.boom"),
+        (("presliding", "boom", {"compliance": 1e-7}), "bristle.boom"),
+        (("pump_lag", "supply", {"time_constant": 0.15}), "delivery.supply"),
+        (("load_holding", "boom.head", {"setting": 40e6}), "spool.boom"),
+        (("orifice_leakage", "boom", {"flow": 4e-4}), "spool.boom"),
+    ],
+)
+def test_effects_are_part_of_the_model(effect, state):
+    machine = load_machine("cat215")
+    model, nominal = linearise(apply_effect(machine, *effect), speed=0.05), linearise(machine, speed=0.05)
+    assert state in model.states and np.isfinite(model.a).all()
+    changed = len(model.states) > len(nominal.states) or not np.allclose(model.operating_state, nominal.operating_state)
+    assert changed or effect[0] == "load_holding"  # which is fully open in this motion
 
 
 def test_a_passive_joint_hangs_at_its_equilibrium():

@@ -3,6 +3,7 @@
 import re
 import threading
 from pathlib import Path
+from socket import create_connection as connect
 
 import numpy as np
 import pytest
@@ -136,6 +137,8 @@ def test_more_frames_and_huge_frames_do_not_stop_the_server():
     huge.socket.setsockopt(zmq.RCVTIMEO, 300)
     with pytest.raises(zmq.Again):
         huge.socket.recv()
+    with connect(("127.0.0.1", server.port)) as stranger:  # not ZeroMQ
+        stranger.sendall(np.random.default_rng(0).bytes(10000))
     assert client.ask(do="step", ticks=100)["done"]
     server.finish()
     for each in (several, huge, client):
