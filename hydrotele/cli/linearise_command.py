@@ -117,7 +117,7 @@ def parse_assignments(option: str, text: str) -> dict[str, float]:
     found: dict[str, float] = {}
     for part in filter(None, text.split(",")):
         name, sign, value = (word.strip() for word in part.partition("="))
-        if not sign or name in found:
+        if not sign or not name or name in found:
             raise InputError(f"{option} {text}", "must be NAME=VALUE,..., for example boom=0.45,stick=-1.6")
         found[name] = _parse_number(option, value)
     return found
