@@ -248,7 +248,10 @@ def linearise(
     forces = np.zeros((n, len(independent)))
     forces[first : 2 * first] = np.linalg.inv(step.mass_matrix(point.state, point.command))[:, : len(independent)]
     kinds = ["torque" if machine.joints[name].type == "hinge" else "force" for name in independent]
-    velocities = [a for a, axis in machine.axes.items() if axis.joint in independent]
+    velocities = [
+        name for name, axis in machine.axes.items()
+        if axis.joint in independent and f"velocity.{name}" not in step.channels
+    ]  # fmt: skip
     rows = np.zeros((len(velocities), n))
     for row, axis in zip(rows, velocities, strict=True):
         row[step.states.index(f"rate.{machine.axes[axis].joint}")] = 1.0
