@@ -37,6 +37,7 @@ _PUBLIC = {
     "control.gravity_model": ("identify_gravity",),
     "core.errors": ("InputError",),
     "effects": ("EFFECTS", "apply_effect", "load_effects"),
+    "estimate.linear_model": ("LinearModel", "linearise"),
     "gap.find": ("find_gap",),
     "gap.patched": ("write_patch",),
     "gap.result": ("Gap", "gap_document"),

@@ -5,6 +5,7 @@ from .control.gravity_model import identify_gravity
 from .core.errors import InputError
 from .effects import EFFECTS, apply_effect, load_effects
 from .envs.controllers.catalogue import make_controller
+from .estimate.linear_model import LinearModel, linearise
 from .gap.find import find_gap
 from .gap.patched import write_patch
 from .gap.result import Gap, gap_document
@@ -20,9 +21,9 @@ from .simulate.plant import Plant, build_plant, initial_state, rest_state
 
 __version__: str
 __all__ = [
-    "EFFECTS", "Dataset", "Gap", "InputError", "Log", "Machine", "Plant", "Replay", "Run",
+    "EFFECTS", "Dataset", "Gap", "InputError", "LinearModel", "Log", "Machine", "Plant", "Replay", "Run",
     "Scenario", "apply_effect", "build_plant", "endpoint_force_of_log", "find_gap", "gap_document",
-    "identify_dynamics", "identify_gravity", "initial_state", "load_dataset", "load_effects",
+    "identify_dynamics", "identify_gravity", "initial_state", "linearise", "load_dataset", "load_effects",
     "load_log", "load_logs", "load_machine", "load_scenario", "make_controller", "replay_log",
     "rest_state", "run_scenario", "save_log", "save_machine", "shipped_machines",
     "shipped_scenarios", "write_patch",

@@ -17,6 +17,7 @@ import typer
 from hydrotele.cli.calibrate_options import app as calibrate_app
 from hydrotele.cli.haptic_device_options import HAPTIC_EPILOG, haptic_device
 from hydrotele.cli.identify_operator_command import IDENTIFY_OPERATOR_EPILOG, identify_operator
+from hydrotele.cli.linearise_command import LINEARISE_EPILOG, linearise
 from hydrotele.cli.new_command import app as new_app
 from hydrotele.cli.number_options import MAX_PROCESSES, NumberCheckingGroup
 from hydrotele.cli.option_values import (
@@ -27,6 +28,7 @@ from hydrotele.cli.option_values import (
     parse_positive_numbers,
 )
 from hydrotele.cli.program_help import DESCRIPTION, format_program_help
+from hydrotele.cli.serve_command import SERVE_EPILOG, serve
 from hydrotele.core.errors import InputError
 
 
@@ -288,8 +290,10 @@ def run(
 
 app.command(epilog=DRIVE_EPILOG)(drive)
 app.command("haptic-device", epilog=HAPTIC_EPILOG)(haptic_device)
+app.command(epilog=SERVE_EPILOG)(serve)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
+app.command(epilog=LINEARISE_EPILOG)(linearise)
 app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_operator)
 
 

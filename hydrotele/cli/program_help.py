@@ -20,6 +20,7 @@ COMMAND_GROUPS = {
         "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
         "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
         "drive": "Drive a machine in real time; write the same files as `run`.",
+        "serve": "Let a client program drive a simulated machine over ZeroMQ; write the same files as `run`.",
         "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
         "demo": "Simulate an excavator, replay its log and draw the results.",
     },
@@ -38,6 +39,7 @@ COMMAND_GROUPS = {
     },
     "Analyse": {
         "analyse": "Analyse a teleoperator by linear two-port theory.",
+        "linearise": "Compute linear state-space models of a machine at poses; list natural frequencies and damping.",
         "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
     },
     "Models and files": {

@@ -224,6 +224,15 @@ class Session:
         """
         self._plan.command[self.tick :, self.plant.axes.index(axis)] = value
 
+    def set_commands(self, values: np.ndarray, n_ticks: int) -> None:
+        """Set the commands of all axes for the next ticks; each axis must have no reference.
+
+        Args:
+            values: (nu,) commands [1], or in the units of the drives.
+            n_ticks: number of ticks.
+        """
+        self._plan.command[self.tick : self.tick + n_ticks] = values
+
     def commands_at(self, tick: int) -> np.ndarray:
         """Return the commands (nu,) of a past tick [1], or in the units of the drives."""
         return self._commands[tick]

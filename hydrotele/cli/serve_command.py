@@ -1,0 +1,86 @@
+"""Implement `hydrotele serve`: a client program drives a simulated machine over ZeroMQ."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hydrotele.cli.option_values import machine_overrides, parse_overrides
+
+if TYPE_CHECKING:
+    from hydrotele.run.live_server import LiveOptions
+
+SERVE_EPILOG = """\b
+Examples:  hydrotele serve hold --duration 60
+           hydrotele serve hold --realtime --set sensors=khoshzaban1992 --out runs/mine
+
+\b
+Clients send msgpack maps over ZeroMQ; docs/live.md describes the protocol and has a client in
+Python. In lockstep (the default) the machine moves only while a client requests it. The run starts
+with the first step, and ends with its duration, a client's stop, or Ctrl-C. There is no
+authentication: listen on addresses other than 127.0.0.1 only in a private network.
+"""
+
+
+def serve(
+    scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file; its pilot is not used.")],
+    realtime: Annotated[bool, typer.Option("--realtime", help="Follow the wall clock instead of lockstep.")] = False,
+    duration: Annotated[
+        float | None, typer.Option(min=0.1, help="Maximum duration [s]; default: that of the scenario.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any free port.")] = 5620,
+    timeout: Annotated[
+        float, typer.Option(min=0.01, help="Silence after which a driving client is released [s].")
+    ] = 1.0,
+    machine: Annotated[str | None, typer.Option("--machine", help="Machine instead of that of the scenario.")] = None,
+    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Override KEY=VALUE. Repeatable.")] = None,
+    review: Annotated[bool, typer.Option("--review/--no-review", help="Write the rerun recording.")] = True,
+    json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
+) -> None:
+    """Let a client program drive a simulated machine over ZeroMQ; write the same files as `run`."""
+    from hydrotele.run.live_server import LiveOptions
+
+    overrides = machine_overrides(machine, tool) | parse_overrides(set_ or [])
+    if duration is not None:
+        overrides["duration"] = repr(duration)
+    serve_to_folder(scenario, overrides, LiveOptions(realtime, timeout, host, port), out, review, json)
+
+
+def serve_to_folder(
+    name: str, overrides: dict[str, str], options: "LiveOptions", target: Path | None, review: bool, as_json: bool
+) -> Path:
+    """Run a scenario with the commands of clients, and write the results to a folder.
+
+    The output folder is written completely or not at all.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        InputError: scenario, address or target are not usable, or the run is too short for a log.
+        SimulationFailed: the state of the simulation is no longer finite.
+    """
+    from hydrotele.cli.console import catch_first_interrupt, print_json, stderr_console, stdout_console
+    from hydrotele.cli.run_command import print_summary, write_run
+    from hydrotele.core.output import atomic_folder, check_output_folder
+    from hydrotele.run.live_server import serve_scenario
+    from hydrotele.scenario.scenario import load_scenario
+    from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
+
+    stop_profiling_clock()
+    scenario = load_scenario(name, overrides)
+    target = target or Path("runs", scenario.name)
+    check_output_folder(target, "run")
+    with catch_first_interrupt() as interrupted:
+        result = serve_scenario(scenario, options, lambda text: stderr_console.print(text, soft_wrap=True), interrupted)
+    with atomic_folder(target, "run") as folder:
+        write_run(result, folder, review)
+    if as_json:
+        print_json({**result.summary, "folder": str(target)})
+    else:
+        print_summary(result.summary)
+        stdout_console.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats this run")
+    return target
