@@ -17,6 +17,7 @@ from hydrotele.show.web_server import PageHandlers, WebServer
 from hydrotele.simulate.mechanism import compile_mechanism
 
 _PAGE_RATE = 60.0  # Hz, rate of the displayed poses and forces
+_MESSAGE_TIME = 5.0  # s
 _WAIT = 0.02  # s between two checks whether a stopped drive continues
 _FAREWELL_TIME = 0.3  # s before the server stops, so that every page receives the last status
 
@@ -44,7 +45,7 @@ class DrivePage:
         self._driver, self._scene, self._due = driver, None, 0.0
         self._description = {"scenario": scenario, "target": str(target), "timeout": INPUT_TIMEOUT}
         self._status: dict[str, Any] = {"scene": False}
-        self._message = ""
+        self._message, self._message_end = "", 0.0
         page = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
         handlers = PageHandlers(driver.process_message, self._page_status, driver.remove_page)
         self._server = WebServer(host, port, page, handlers)
@@ -78,8 +79,8 @@ class DrivePage:
             raise ResetRequested
 
     def show_message(self, text: str) -> None:
-        """Display a message on all pages."""
-        self._message = text
+        """Display a message on all pages for 5 s."""
+        self._message, self._message_end = text, clock.monotonic() + _MESSAGE_TIME
 
     def close(self) -> None:
         """Display that the drive has ended, and stop the server."""
@@ -110,4 +111,5 @@ class DrivePage:
         }
 
     def _page_status(self, page: int) -> dict[str, Any]:
-        return {**self._description, **self._status, **self._driver.describe_page(page), "message": self._message}
+        message = self._message if clock.monotonic() < self._message_end else ""
+        return {**self._description, **self._status, **self._driver.describe_page(page), "message": message}

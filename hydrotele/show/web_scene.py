@@ -7,6 +7,7 @@ import contextlib
 import io
 import logging
 import threading
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -20,7 +21,12 @@ from hydrotele.show.visual_geometry import BodyMesh, body_meshes, ground_height
 from hydrotele.show.web_server import import_viser
 
 _PLOT_DURATION, _PLOT_INTERVAL = 10.0, 0.1  # s, simulated time that a plot displays, and its resolution
-_PLOT_HEIGHT = 130  # pixels
+_PLOT_HEIGHT = 90  # pixels
+_PRESSURE_RANGE = {"min": {"hard": 0.0, "soft": 0.0, "mode": 1, "pad": 0.0}, "max": {"pad": 0.15, "soft": 1.0, "mode": 1}}
+_FIELD_OF_VIEW = 0.8  # rad, vertical
+_MIN_ASPECT = 1.3  # width per height of a view that shows the whole machine from the default distance
+_MAX_RETREAT = 3.0  # limit of the camera distance, relative to the default distance
+_MIN_WIDTH_FOR_PLOTS = 700  # pixels, of a view in which the plots are open at first
 _LINE_COLOURS = ("#1f6feb", "#d1242f")  # head and rod side
 _CLOSE_TIMEOUT = 5.0  # s
 
@@ -44,13 +50,18 @@ class WebScene:
         for number, look in enumerate(body_meshes(model)):
             _add_mesh(self._server.scene, f"/body_{look.body}/mesh_{number}", look)
         self._add_ground()
-        camera, target = compute_machine_camera(model, None)
-        self._server.initial_camera.position, self._server.initial_camera.look_at = tuple(camera), tuple(target)
-        self._plots = self._add_plots(hydraulic_axes)
+        self._camera, self._target = compute_machine_camera(model, None)
+        first = self._server.initial_camera
+        first.position, first.look_at, first.fov = tuple(self._camera), tuple(self._target), _FIELD_OF_VIEW
+        self._axes, self._plots = tuple(hydraulic_axes), {}
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.gui.set_panel_label("MPa: head blue, rod red" if self._axes else "no hydraulic axes")
         self._history: deque[tuple[float, np.ndarray]] = deque()
         self._poses: np.ndarray | None = None
         self._newest: tuple[np.ndarray, np.ndarray, float] | None = None
         self._fresh, self._is_over = threading.Event(), False
+        self._server.on_client_connect(self._fit_to_page)
+        self._server.on_client_disconnect(lambda client: self._plots.pop(client.client_id, None))
         self._painter = threading.Thread(target=self._send_states, daemon=True)
         self._painter.start()
 
@@ -72,6 +83,17 @@ class WebScene:
         self._painter.join(_CLOSE_TIMEOUT)
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints that it stops
             self._server.stop()
+
+    def _fit_to_page(self, client: Any) -> None:
+        """Add the plots to a new page; close them in a small view, and move the camera of a narrow view back."""
+        width, height = client.camera.image_width, client.camera.image_height
+        if height and width < _MIN_ASPECT * height:
+            way = (self._camera - self._target) * min(_MAX_RETREAT, _MIN_ASPECT * height / max(1, width))
+            client.camera.position = self._target + way
+            client.camera.look_at = self._target
+        if self._axes:
+            with client.gui.add_folder("pressures", expand_by_default=width >= _MIN_WIDTH_FOR_PLOTS):
+                self._plots[client.client_id] = [_add_plot(client.gui, axis) for axis in self._axes]
 
     def _send_states(self) -> None:
         """Send the latest state to viser in a loop, in a separate thread so that the simulation does not wait."""
@@ -100,34 +122,17 @@ class WebScene:
         history = self._history
         if history and time < history[-1][0]:  # the machine was reset
             history.clear()
-        if not self._plots or (history and time - history[-1][0] < _PLOT_INTERVAL):
+        if history and time - history[-1][0] < _PLOT_INTERVAL:
             return
         history.append((time, 1e-6 * pressures))
         while time - history[0][0] > _PLOT_DURATION:
             history.popleft()
+        if len(history) < 2:
+            return
         times, values = np.array([at for at, _ in history]), np.array([value for _, value in history])
-        with self._server.atomic():
-            for number, plot in enumerate(self._plots):
+        for plots in list(self._plots.values()):
+            for number, plot in enumerate(plots):
                 plot.data = (times, values[:, number, 0], values[:, number, 1])
-
-    def _add_plots(self, axes: Sequence[str]) -> list[Any]:
-        """Add a plot of the two pressures of each axis; return the plots."""
-        gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False)
-        gui.set_panel_label("pressures [MPa]" if axes else "no hydraulic axes")
-        empty = np.zeros(1)
-        lines = tuple(
-            {"label": side, "stroke": colour, "width": 1.5}
-            for side, colour in zip(("head", "rod"), _LINE_COLOURS, strict=True)
-        )
-        return [
-            gui.add_uplot(
-                data=(empty, empty, empty), series=({"label": "s"}, *lines), title=axis,
-                scales={"x": {"time": False}}, height=_PLOT_HEIGHT,
-                axes=({"size": 24}, {"size": 36}), legend={"show": False},
-            )
-            for axis in axes
-        ]  # fmt: skip
 
     def _add_ground(self) -> None:
         height = ground_height(self._model)
@@ -149,8 +154,23 @@ def _start_viser() -> Any:
             """Do nothing."""
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # no tracebacks of failed connections
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # plots of a page that just closed
     with contextlib.redirect_stdout(io.StringIO()):
         return Viewer(host="127.0.0.1", port=0, verbose=False)
+
+
+def _add_plot(gui: Any, axis: str) -> Any:
+    """Add a plot of the head- and rod-side pressures of an axis to the panel of a page."""
+    empty = np.array([0.0, _PLOT_INTERVAL])  # uPlot fails with a single point
+    lines = tuple(
+        {"label": side, "stroke": colour, "width": 1.5}
+        for side, colour in zip(("head", "rod"), _LINE_COLOURS, strict=True)
+    )
+    return gui.add_uplot(
+        data=(empty, empty, empty), series=({"label": "s"}, *lines), title=axis, height=_PLOT_HEIGHT,
+        scales={"x": {"time": False}, "y": {"range": _PRESSURE_RANGE}},
+        axes=({"size": 24}, {"size": 36}), legend={"show": False},
+    )  # fmt: skip
 
 
 def _add_mesh(scene: Any, name: str, look: BodyMesh) -> None:
