@@ -323,8 +323,8 @@ def _find_undetermined_joints(scenario: Scenario) -> list[str]:
 
 
 def _default_scenario_path(machine: str) -> Path | None:
-    path = Path(__file__).with_name(f"drive_{machine}.yaml")
-    return path if "/" not in machine and path.is_file() else None
+    path = Path(__file__).parent / f"drive_{machine}.yaml"  # no such file if the machine is a path
+    return path if path.is_file() else None
 
 
 def _print_message(sentence: str) -> None:
