@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
+_KEEP_CONNECTED = b"<head><script>Document.prototype.hasFocus = () => true</script>"
+"""Start of viser's page: viser connects again only if its page has the focus, which an embedded page has not."""
 STATUS_RATE = 30.0  # Hz, rate of the status messages to every page
 _MIN_MESSAGE_INTERVAL = 0.002  # s between two messages of one page, so that no page occupies the computer
 _MAX_MESSAGE_SIZE = 65_536  # bytes
@@ -230,7 +232,7 @@ def _address_error(host: str, port: int, error: OSError) -> InputError:
 def _fetch_page(port: int) -> bytes:
     """Return viser's own page from the viser server on a port of this computer."""
     with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(f"http://127.0.0.1:{port}/") as answer:
-        return answer.read()
+        return answer.read().replace(b"<head>", _KEEP_CONNECTED, 1)
 
 
 def _make_page(connection: "ServerConnection", body: bytes, headers: dict[str, str]) -> "Response":
