@@ -22,7 +22,10 @@ from hydrotele.show.web_server import import_viser
 
 _PLOT_DURATION, _PLOT_INTERVAL = 10.0, 0.1  # s, simulated time that a plot displays, and its resolution
 _PLOT_HEIGHT = 90  # pixels
-_PRESSURE_RANGE = {"min": {"hard": 0.0, "soft": 0.0, "mode": 1, "pad": 0.0}, "max": {"pad": 0.15, "soft": 1.0, "mode": 1}}
+_PRESSURE_RANGE = {
+    "min": {"hard": 0.0, "soft": 0.0, "mode": 1, "pad": 0.0},
+    "max": {"pad": 0.15, "soft": 1.0, "mode": 1},
+}
 _FIELD_OF_VIEW = 0.8  # rad, vertical
 _MIN_ASPECT = 1.3  # width per height of a view that shows the whole machine from the default distance
 _MAX_RETREAT = 3.0  # limit of the camera distance, relative to the default distance

@@ -239,7 +239,11 @@ def _make_page(connection: "ServerConnection", body: bytes, headers: dict[str, s
     """Return an HTTP response with an HTML page."""
     response = connection.respond(http.HTTPStatus.OK, "")
     del response.headers["Content-Type"], response.headers["Content-Length"]
-    content = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store"}
+    content = {
+        "Content-Type": "text/html; charset=utf-8",
+        "Content-Length": str(len(body)),
+        "Cache-Control": "no-store",
+    }
     for name, value in {**content, "X-Content-Type-Options": "nosniff", **headers}.items():
         response.headers[name] = value
     response.body = body

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from hydrotele.cli.drive_command import DriveOptions, drive_to_folder
 from hydrotele.core.errors import InputError
@@ -58,11 +59,17 @@ class Drive:
             self.error = error
 
     def control(self, **options):
-        return connect(f"ws://127.0.0.1:{self.port}/control", **options)
+        """Connect like a page."""
+        return connect(f"ws://127.0.0.1:{self.port}/control", close_timeout=0.5, **options)
+
+    def wait_until_ready(self, page):
+        while not json.loads(page.recv(timeout=60.0))["scene"]:
+            pass
 
     def finish(self):
         """End the drive as any page could, and wait until its folder is written."""
         with contextlib.suppress(OSError, ConnectionClosed), self.control() as page:
+            self.wait_until_ready(page)
             page.send('{"kind": "start"}')
             time.sleep(0.5)  # a log needs ten rows
             page.send('{"kind": "finish"}')
@@ -225,6 +232,7 @@ def test_all_controls_are_on_the_screen(open_page, width, height):
 
 
 @needs_chromium
+@pytest.mark.nightly  # draws for half a minute without a graphics processor
 def test_scene_is_drawn_without_errors_and_keys_do_not_move_its_camera(browser, drive):
     page = browser.new_page(viewport={"width": 360, "height": 480}, bypass_csp=True)
     page.set_default_timeout(WAIT)
@@ -260,7 +268,7 @@ def test_foreign_sites_malformed_messages_and_slow_pages_do_no_harm(drive):
             urllib.request.urlopen(urllib.request.Request(drive.url, headers=headers))
     for path in ("control", "scene"):
         with pytest.raises(InvalidStatus, match="403"):
-            connect(f"ws://127.0.0.1:{drive.port}/{path}", origin="http://example.org")
+            connect(f"ws://127.0.0.1:{drive.port}/{path}", origin=Origin("http://example.org"))
     for path in ("else", "../etc/passwd", "%2e%2e/etc/passwd", "view/x"):
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(drive.url + path)
@@ -287,6 +295,7 @@ def test_run_is_that_of_any_drive(tmp_path):
     with pytest.raises(InputError, match="in use"):
         WebServer("127.0.0.1", drive.port, "", PageHandlers(lambda *_: "", lambda _: {}, lambda _: None))
     with drive.control() as page:
+        drive.wait_until_ready(page)
         page.send('{"kind": "start"}')
         end = time.monotonic() + 1.5
         while time.monotonic() < end:

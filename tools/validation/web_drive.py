@@ -19,11 +19,13 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from time import time as wall_time
 
 import numpy as np
 import viser
 from playwright.sync_api import Page, sync_playwright
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from hydrotele.run.interactive_run import Pacer, drive_scenario
 from hydrotele.run.run import load_simulated_machine
@@ -56,15 +58,15 @@ class Recorder(WebDriver):
         self.inputs, self.ticks, self.commands = [], [], []
         self._before = (0.0,) * 6
 
-    def read(self, time_):
-        reading = super().read(time_)
+    def read(self, time):
+        reading = super().read(time)
         if reading.axes != self._before:
-            self.inputs.append(time.time())
+            self.inputs.append(wall_time())
             self._before = reading.axes
         return reading
 
     def record_tick(self, session):
-        self.ticks.append(time.time())
+        self.ticks.append(wall_time())
         self.commands.append(session.commands_at(session.tick - 1)[session.plant.axes.index("boom")])
 
 
@@ -148,7 +150,7 @@ def press_keys(page: Page, count: int) -> list[float]:
 
 def count_pose_messages(url: str, seconds: float) -> float:
     """Return the messages per second that a further page receives from viser while the machine moves."""
-    protocol = f"viser-v{viser.__version__}"
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
     with connect(url.replace("http", "ws") + "scene", subprotocols=[protocol], max_size=None) as scene:
         end = time.monotonic() + 2.0
         while time.monotonic() < end:  # the initial scene
@@ -164,6 +166,7 @@ def save_pictures(page: Page, folder: Path):
     folder.mkdir(parents=True, exist_ok=True)
     close_notes(page)
     page.screenshot(path=folder / "wide.png")
+    assert page.context.browser
     narrow = page.context.browser.new_page(viewport={"width": 390, "height": 800}, bypass_csp=True)
     narrow.goto(page.url)
     narrow.frame_locator("#scene").get_by_text("pressures").first.wait_for(timeout=120_000)
