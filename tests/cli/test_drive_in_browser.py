@@ -3,7 +3,10 @@
 import contextlib
 import json
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -62,14 +65,9 @@ class Drive:
         """Connect like a page."""
         return connect(f"ws://127.0.0.1:{self.port}/control", close_timeout=0.5, **options)
 
-    def wait_until_ready(self, page):
-        while not json.loads(page.recv(timeout=60.0))["scene"]:
-            pass
-
     def finish(self):
         """End the drive as any page could, and wait until its folder is written."""
         with contextlib.suppress(OSError, ConnectionClosed), self.control() as page:
-            self.wait_until_ready(page)
             page.send('{"kind": "start"}')
             time.sleep(0.5)  # a log needs ten rows
             page.send('{"kind": "finish"}')
@@ -289,27 +287,31 @@ def test_foreign_sites_malformed_messages_and_slow_pages_do_no_harm(drive):
         assert slow.recv(timeout=5.0)  # has not read so far
 
 
-def test_run_is_that_of_any_drive(tmp_path):
-    """The page is a WebSocket here. The scenario of the folder repeats the run."""
-    drive = Drive(tmp_path / "out", overrides={"control_rate": "200"})
+def test_ctrl_c_ends_the_command_and_writes_the_run(tmp_path):
+    """The page is a WebSocket here. Standard output holds nothing but the JSON."""
+    target, port = tmp_path / "out", free_port()
+    command = f"drive --web --port {port} --no-review --json --set control_rate=200 --out".split()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hydrotele", *command, str(target)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stderr and f"open http://127.0.0.1:{port}/" in process.stderr.readline().decode()
     with pytest.raises(InputError, match="in use"):
-        WebServer("127.0.0.1", drive.port, "", PageHandlers(lambda *_: "", lambda _: {}, lambda _: None))
-    with drive.control() as page:
-        drive.wait_until_ready(page)
+        WebServer("127.0.0.1", port, "", PageHandlers(lambda *_: "", lambda _: {}, lambda _: None))
+    with connect(f"ws://127.0.0.1:{port}/control", close_timeout=0.5) as page:
+        while not json.loads(page.recv(timeout=60.0))["scene"]:
+            pass
         page.send('{"kind": "start"}')
-        end = time.monotonic() + 1.5
-        while time.monotonic() < end:
+        while json.loads(page.recv(timeout=5.0))["time"] < 1.5:
             page.send('{"kind": "input", "axes": [0, 0, 1, 0, 0, 0]}')
-            page.recv()
-        page.send('{"kind": "zero"}')
-        time.sleep(0.3)
-        page.send('{"kind": "finish"}')
-    drive.finish()
-    log = load_log(tmp_path / "out" / "measured.parquet")
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 0 and b"Traceback" not in errors
+    summary = json.loads((target / "summary.json").read_text())
+    assert json.loads(output) == {**summary, "folder": str(target)} and summary["kind"] == "run"
+    assert {"pauses", "paused_seconds", "teleoperation"} <= summary.keys()
+    log = load_log(target / "measured.parquet")
     assert log["tip_pose.z"][-1] - log["tip_pose.z"][0] > 0.05 and np.ptp(log["angle.boom"]) > np.radians(0.5)
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["kind"] == "run" and {"pauses", "paused_seconds", "teleoperation"} <= summary.keys()
-    assert "follow" in (tmp_path / "out" / "scenario.yaml").read_text()
+    assert "follow" in (target / "scenario.yaml").read_text()  # the operator that repeats the input
 
 
 @pytest.mark.parametrize(
