@@ -14,6 +14,7 @@ drawn frames    frames per second that Chromium draws; depends on the graphics p
 """
 
 import argparse
+import json
 import shutil
 import tempfile
 import threading
@@ -116,22 +117,24 @@ def measure_page(url: str, driver: Recorder, options: argparse.Namespace) -> dic
         if not options.no_scene:
             page.frame_locator("#scene").locator("canvas").first.wait_for(timeout=120_000)
             time.sleep(5.0)
-        page.evaluate("document.getElementById('run').click()")  # page.click waits for drawn frames
-        page.wait_for_function("status.running")
+        start(page)
         result["round trips"] = press_keys(page, options.presses)
         result["keys"] = page.evaluate("keys.splice(0)")[: options.presses]
-        page.keyboard.down("KeyI")
-        result["poses"] = count_pose_messages(url, options.seconds)
         if not options.no_scene:
+            start(page)
+            page.keyboard.down("KeyI")
             result["frames"] = page.frames[1].evaluate(COUNT_FRAMES, options.seconds)
-        if options.pictures:
-            save_pictures(page, options.pictures)
-        page.keyboard.up("KeyI")
-        start, begun = time.process_time(), time.monotonic()
-        time.sleep(options.seconds)
-        result["processor"] = (time.process_time() - start) / (time.monotonic() - begun)
+            if options.pictures:
+                save_pictures(page, options.pictures)
         browser.close()
+    result["poses"], result["processor"] = count_pose_messages(url, options.seconds)
     return result
+
+
+def start(page: Page):
+    page.wait_for_function("status.role !== 'watcher'")
+    page.evaluate("isDriver() && status.running || document.getElementById('run').click()")  # needs no drawn frame
+    page.wait_for_function("isDriver() && status.running")
 
 
 def press_keys(page: Page, count: int) -> list[float]:
@@ -148,18 +151,26 @@ def press_keys(page: Page, count: int) -> list[float]:
     return [trip for trip in trips if trip is not None]
 
 
-def count_pose_messages(url: str, seconds: float) -> float:
-    """Return the messages per second that a further page receives from viser while the machine moves."""
-    protocol = Subprotocol(f"viser-v{viser.__version__}")
-    with connect(url.replace("http", "ws") + "scene", subprotocols=[protocol], max_size=None) as scene:
-        end = time.monotonic() + 2.0
-        while time.monotonic() < end:  # the initial scene
-            scene.recv(timeout=5.0)
-        count, end = 0, time.monotonic() + seconds
-        while time.monotonic() < end:
+def count_pose_messages(url: str, seconds: float) -> tuple[float, float]:
+    """Return the pose messages per second of a page of a moving machine, and the processor time per second.
+
+    Both pages are WebSockets here. The processor time is that of simulation, server and these pages.
+    """
+    address, protocol = url.replace("http", "ws"), Subprotocol(f"viser-v{viser.__version__}")
+    with (
+        connect(address + "control", close_timeout=0.5) as page,
+        connect(address + "scene", subprotocols=[protocol], max_size=None, close_timeout=0.5) as scene,
+    ):
+        page.send('{"kind": "start"}')
+        count, begun, counting = 0, time.monotonic(), False
+        while (now := time.monotonic() - begun) < 2.0 + seconds:
+            if not counting and now > 2.0:  # the scene has arrived
+                count, counting, processor = 0, True, time.process_time()
+            raised = 1 if now % 4.0 < 2.0 else -1
+            page.send(json.dumps({"kind": "input", "axes": [0, 0, raised, 0, 0, 0]}))
             scene.recv(timeout=5.0)
             count += 1
-    return count / seconds
+        return count / seconds, (time.process_time() - processor) / seconds
 
 
 def save_pictures(page: Page, folder: Path):
@@ -202,7 +213,7 @@ def print_table(measured: dict, driver: Recorder, pacer: Pacer):
     print(f"\npose messages: {measured['poses']:.1f} per second")
     if "frames" in measured:
         print(f"drawn frames: {measured['frames']:.1f} per second")
-    print(f"processor time of simulation and server: {measured['processor']:.2f} s per second")
+    print(f"processor time of simulation, server and two pages: {measured['processor']:.2f} s per second")
     print(f"pauses: {pacer.pauses}, {pacer.total_delay:.2f} s")
 
 
