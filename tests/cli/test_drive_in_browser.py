@@ -304,7 +304,7 @@ def test_ctrl_c_ends_the_command_and_writes_the_run(tmp_path):
         while json.loads(page.recv(timeout=5.0))["time"] < 1.5:
             page.send('{"kind": "input", "axes": [0, 0, 1, 0, 0, 0]}')
         process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=60.0)
+        output, errors = process.communicate(timeout=180.0)
     assert process.returncode == 0 and b"Traceback" not in errors
     summary = json.loads((target / "summary.json").read_text())
     assert json.loads(output) == {**summary, "folder": str(target)} and summary["kind"] == "run"
