@@ -78,7 +78,8 @@ hypothesis.settings.load_profile("daily")
 # Files that take three seconds or more, the longest first: two processes then end together. A file
 # that is missing here costs at most its own length at the end.
 LONG = (
-    "cli/test_cli.py", "gap/test_run_differences.py", "gap/test_model_search.py", "gap/test_find.py",
+    "cli/test_cli.py", "cli/test_drive_in_browser.py", "gap/test_run_differences.py",
+    "gap/test_model_search.py", "gap/test_find.py",
     "gap/test_laws.py", "gap/test_mechanism.py", "scenario/test_scenario.py",
     "teleop/test_analyse_command.py", "identify/test_estimation.py", "test_architecture.py",
     "identify/test_identification.py", "show/test_pictures.py", "tools/test_check_english.py",

@@ -1,7 +1,7 @@
 """Implement `hydrotele drive`: an operator drives a simulated machine in real time.
 
-The operator uses a keyboard, gamepad, SpaceMouse or haptic device, or a script replaces the
-operator. The results are written to a folder with the same files as those of `hydrotele run`.
+The operator uses a keyboard, gamepad, SpaceMouse, haptic device or web page, or a script replaces
+the operator. The results are written to a folder with the same files as those of `hydrotele run`.
 """
 
 import contextlib
@@ -38,6 +38,7 @@ from hydrotele.run.interactive_run import (
 )
 from hydrotele.run.run import Run, load_simulated_machine
 from hydrotele.run.session import Session
+from hydrotele.run.web_driver import WebDriver
 from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.closed_loops import dependent_joints
@@ -67,6 +68,7 @@ class DriveOptions(NamedTuple):
         review: whether to write the rerun recording.
         json: print JSON instead of text.
         latency: whether to measure and print latencies of a haptic device.
+        web: (host, port) of a web page that replaces device and window; None without one.
     """
 
     scenario: str | None
@@ -79,6 +81,7 @@ class DriveOptions(NamedTuple):
     review: bool
     json: bool
     latency: bool = False
+    web: tuple[str, int] | None = None
 
 
 def drive_to_folder(options: DriveOptions) -> Path:
@@ -94,6 +97,8 @@ def drive_to_folder(options: DriveOptions) -> Path:
         SimulationFailed: the state of the simulation is no longer finite.
     """
     stop_profiling_clock()
+    if options.web:
+        return _drive_in_browser(options, *options.web)
     if _is_haptic_device(options) and options.speed != 1.0:
         raise InputError("--speed", "must be 1 with a haptic device, which runs in real time")
     if options.device == "keyboard" and not options.viewer and not options.latency:
@@ -144,6 +149,67 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
             "machine": machine_side, "channel": result.summary["haptic"],
             "computer": {**idle_test, **_measure_stolen_time(stolen, clock.monotonic() - begun)},
         }  # fmt: skip
+    _write(result, target, options)
+    return target
+
+
+def _drive_in_browser(options: DriveOptions, host: str, port: int) -> Path:
+    """Run one drive that a web page controls: serve the page, simulate, and write the results.
+
+    Args:
+        options: options of the command.
+        host: address of the network interface of the page.
+        port: port of the page, 0 for any free one.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        InputError: another device or a latency test is requested, or the address cannot be used.
+    """
+    if options.device != "keyboard":
+        message = "has no effect with --web, whose page reads keyboard and gamepad; omit one of them"
+        raise InputError(f"--device {options.device}", message)
+    if options.latency:
+        raise InputError("--latency", "needs a haptic device; omit --web")
+    if options.speed <= 0.0:
+        raise InputError("--speed", "must be positive with --web")
+    from hydrotele.show.drive_page import DrivePage, ResetRequested
+    from hydrotele.show.web_server import LOOPBACK_NAMES
+
+    scenario = _load_drive_scenario(options)
+    target = options.target or Path("runs", scenario.name)
+    check_output_folder(target, "run")
+    machine = load_simulated_machine(scenario)
+    driver, pacer = WebDriver(len(axes_not_moved_by_joystick(machine))), Pacer(options.speed)
+    page = DrivePage(host, port, driver, scenario.name, target)
+    stderr_console.print(f"open [bold]{page.url}[/] in a browser; Ctrl-C stops the drive and writes the logs")
+    if host not in LOOPBACK_NAMES:
+        stderr_console.print("[yellow]note[/] every computer that reaches this address can drive the machine")
+
+    def say(sentence: str) -> None:
+        page.show_message(sentence)
+        _print_message(sentence)
+
+    try:
+        with (
+            catch_first_interrupt() as interrupted,
+            _show_progress(options._replace(viewer=False), driver, interrupted) as watch,
+        ):
+
+            def update(session: Session, status: Callable[[], Status], now: float) -> bool:
+                page.update(session, status, pacer, interrupted)
+                return watch(session, status, now)
+
+            result = None
+            while result is None:
+                try:
+                    result = drive_scenario(scenario, machine, driver, pacer, update, say)
+                except ResetRequested:
+                    pacer = Pacer(options.speed)
+                    say("the machine is in its initial state")
+    finally:
+        page.close()
     _write(result, target, options)
     return target
 
@@ -257,8 +323,8 @@ def _find_undetermined_joints(scenario: Scenario) -> list[str]:
 
 
 def _default_scenario_path(machine: str) -> Path | None:
-    path = Path(__file__).with_name(f"drive_{machine}.yaml")
-    return path if "/" not in machine and path.is_file() else None
+    path = Path(__file__).parent / f"drive_{machine}.yaml"  # no such file if the machine is a path
+    return path if path.is_file() else None
 
 
 def _print_message(sentence: str) -> None:

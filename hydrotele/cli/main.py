@@ -130,6 +130,7 @@ DRIVE_EPILOG = """\b
 Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
            hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
+           hydrotele drive --web --port 8080    # in a browser, needs pip install 'hydrotele[web]'
 
 \b
 Keyboard: each key press changes the command of an axis by a quarter of its maximum. The command
@@ -148,6 +149,12 @@ together switch all off.
 haptic:HOST:PORT: a device with force output, served there by hydrotele haptic-device. The force
 reflection runs at 1 kHz, separately from the simulation of the machine. --latency prints delays
 and missed deadlines; without --device it starts a simulated device in its own process for 60 s.
+
+\b
+--web: a page with the machine, two joysticks, forces and pressures. It reads keyboard and gamepad.
+One page drives, others watch. All commands go to zero if the page that drives sends nothing for
+0.5 s. Only this computer can open the page; for another computer forward the port with
+ssh -L 8080:127.0.0.1:8080 SERVER, or give --host 0.0.0.0, which lets everyone in the network drive.
 """
 
 
@@ -167,11 +174,18 @@ def drive(
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     effects: EffectFilesOption = None,
     latency: Annotated[bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")] = False,
+    web: Annotated[bool, typer.Option("--web", help="Drive in a browser, without a screen on this computer.")] = False,
+    host: Annotated[str | None, typer.Option("--host", help="Interface for --web; default: 127.0.0.1.")] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="Port for --web; default: 8080, 0: any.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Drive a machine in real time; write the same files as `run`."""
     from hydrotele.cli.drive_command import DriveOptions, drive_to_folder
 
+    if not web and (host is not None or port is not None):
+        raise InputError("--host" if host is not None else "--port", "needs --web")
     drive_to_folder(
         DriveOptions(
             scenario,
@@ -184,6 +198,7 @@ def drive(
             review,
             json,
             latency,
+            (host or "127.0.0.1", 8080 if port is None else port) if web else None,
         )  # fmt: skip
     )
 

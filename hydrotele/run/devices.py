@@ -36,7 +36,7 @@ from hydrotele.core.files import read_text
 from hydrotele.machine.joystick import AXES
 from hydrotele.scenario.teleoperation import JoystickAxis
 
-_AXIS_DECIMALS = 2  # decimals of an axis value: finer than an operator can set, and short in a file
+AXIS_DECIMALS = 2  # decimals of an axis value: finer than an operator can set, and short in a file
 
 
 class Reading(NamedTuple):
@@ -84,7 +84,7 @@ def remove_dead_zone(value: float, dead_zone: float) -> float:
     beyond = min(1.0, abs(value)) - dead_zone
     if not beyond > 0.0:
         return 0.0
-    size = round(beyond / (1.0 - dead_zone), _AXIS_DECIMALS)
+    size = round(beyond / (1.0 - dead_zone), AXIS_DECIMALS)
     return size if value > 0.0 else -size
 
 

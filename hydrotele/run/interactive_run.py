@@ -213,6 +213,10 @@ class Pacer:
         self.total_delay -= early
         return -early
 
+    def restart(self) -> None:
+        """Let simulated time continue at the next call of `wait_for_tick`, after a stop that is no pause."""
+        self._begin = None
+
     def close(self) -> None:
         """Do nothing; a `Pacer` holds no resources."""
 

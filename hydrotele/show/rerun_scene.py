@@ -37,8 +37,8 @@ _GHOST_COLOUR = np.array([40.0, 130.0, 255.0])
 _GHOST_TINT = 0.7  # fraction of the ghost colour in the displayed colour
 _GHOST_OPACITY = 0.35
 _GHOST_INSET = 0.01  # m, reduction in size, so that the solid machine hides an equal ghost
-_GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
-_GROUND_HALF_SIZE, _TILE_LENGTH = 20.0, 2.0  # m
+GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
+GROUND_HALF_SIZE, TILE_LENGTH = 20.0, 2.0  # m
 _SOIL_PERIOD = 0.1  # s between two meshes of the same trench
 _TIP_COLOUR, _GHOST_TIP_COLOUR = (215, 40, 30), (40, 110, 230)
 
@@ -103,11 +103,11 @@ def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel, soil: SoilHi
     if height is None:
         return False
     if soil:
-        mesh, parity = make_ground_around_trench(soil.bed, _GROUND_HALF_SIZE, _TILE_LENGTH)
+        mesh, parity = make_ground_around_trench(soil.bed, GROUND_HALF_SIZE, TILE_LENGTH)
     else:
-        mesh, parity = shapes.make_chequered_square(_GROUND_HALF_SIZE, round(2.0 * _GROUND_HALF_SIZE / _TILE_LENGTH))
+        mesh, parity = shapes.make_chequered_square(GROUND_HALF_SIZE, round(2.0 * GROUND_HALF_SIZE / TILE_LENGTH))
     mesh = shapes.transform_mesh(mesh, (0.0, 0.0, height), np.eye(3))
-    stream.log("ground", make_rerun_mesh(BodyMesh(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
+    stream.log("ground", make_rerun_mesh(BodyMesh(0, 1.0, mesh, GROUND_COLOURS[parity])), static=True)
     return True
 
 
