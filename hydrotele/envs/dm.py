@@ -23,13 +23,13 @@ FLAT_KEY = "observations"  # dm_control's key for a flat observation
 
 
 def load(
-    task_name: str, random: int | np.random.RandomState | None = None,
+    task_name: Any, random: int | np.random.RandomState | None = None,
     flat_observation: bool = False, **options: Any,
 ) -> "MachineEnvironment":  # fmt: skip
     """Make an environment, as `dm_control.suite.load` does.
 
     Args:
-        task_name: a name in `hydrotele.envs.task_catalogue.TASKS`.
+        task_name: name of a task, or a class or object of `PythonTask`.
         random: seed of the episodes, or a random state from which a seed is drawn; None uses a seed
             from the operating system.
         flat_observation: whether to return all observations as one array under the key
@@ -60,7 +60,7 @@ class MachineEnvironment(dm_env.Environment):
     """
 
     def __init__(
-        self, task_name: str, random: int | np.random.RandomState | None, flat: bool,
+        self, task_name: Any, random: int | np.random.RandomState | None, flat: bool,
         options: Mapping[str, Any],
     ) -> None:  # fmt: skip
         """Create the environment and compile the machine variants.

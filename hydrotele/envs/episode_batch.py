@@ -24,11 +24,10 @@ from hydrotele.envs.episode import (
     make_seed_states,
 )
 from hydrotele.envs.observation import list_machine_observation_fields
-from hydrotele.envs.task import Options, Task
+from hydrotele.envs.task import Options, Task, load_task_machine
 from hydrotele.envs.task_parameters import make_task_parameters
 from hydrotele.envs.task_setup import TaskSetup, make_timing
 from hydrotele.envs.variants import make_variants
-from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.batch import SimulationBatch
 from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
@@ -70,11 +69,12 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
         duration=task.duration if options.duration is None else options.duration,
     )  # fmt: skip
     check_count("variants", options.variants, 1, MAX_VARIANTS)
-    machine, clock = load_machine(task.machine, task.tool), make_timing(options)
-    arm = arm_axes(machine)
-    axes = (*arm, *task.extra_axes)
+    machine, clock = load_task_machine(task, options), make_timing(options)
+    arm = arm_axes(machine) if machine.arm else ()
     variants = make_variants(task, options, machine)
-    fields = [*list_machine_observation_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
+    axes = (*arm, *task.extra_axes) or variants.plant.axes
+    readings = list_machine_observation_fields(machine, axes, len(arm)) if task.with_readings else []
+    fields = [*readings, *task.fields(machine, axes)]
     table = tabulate_drive_geometry(machine, variants.plant.axes)[1]
     return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 

@@ -154,13 +154,13 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
 
     def __init__(
-        self, task: str, render_mode: str | None = None, width: int = 640, height: int = 480,
+        self, task: Any, render_mode: str | None = None, width: int = 640, height: int = 480,
         camera: Camera = None, **options: Any,
     ) -> None:  # fmt: skip
         """Create the environment: compile the machine variants and define observation and action space.
 
         Args:
-            task: name of the task, as in `hydrotele/<Name>-v0`.
+            task: name of the task, as in `hydrotele/<Name>-v0`, or a class or object of `PythonTask`.
             render_mode: None, `rgb_array` for images, or `human` for a window.
             width: width of images [pixel].
             height: height of images [pixel].
@@ -287,14 +287,14 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
-        self, task: str, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
+        self, task: Any, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, width: int = 640,
         height: int = 480, camera: Camera = None, render_count: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Create the environments: compile the machine variants and define observation and action spaces.
 
         Args:
-            task: name of the task.
+            task: name of the task, or a class or object of `PythonTask`.
             num_envs: number of environments n.
             render_mode: None or `rgb_array`.
             threads: number of threads that step the environments; 0 for one per core. Results do

@@ -158,13 +158,13 @@ class StableVecEnv(_VecEnvBase):
     """
 
     def __init__(
-        self, task: str, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
+        self, task: Any, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
         **options: Any,
     ) -> None:  # fmt: skip
         """Create the environments: compile the machine variants and define the spaces.
 
         Args:
-            task: name of the task.
+            task: name of the task, or a class or object of `PythonTask`.
             num_envs: number of environments n.
             threads: number of threads that step the environments; 0 for one per core.
             view: transform between environment and agent, made from the same task and options.
