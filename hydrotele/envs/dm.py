@@ -17,6 +17,7 @@ from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.gymnasium_env import make_info
 from hydrotele.envs.observation import ObservationField
 from hydrotele.envs.rendering import FREE_CAMERA, Camera, TaskRenderer
+from hydrotele.envs.saved_state import SavedState
 from hydrotele.envs.task_catalogue import make_task_core
 
 FLAT_KEY = "observations"  # dm_control's key for a flat observation
@@ -113,6 +114,16 @@ class MachineEnvironment(dm_env.Environment):
         if core.terminated[0]:
             return dm_env.termination(reward, seen)
         return dm_env.truncation(reward, seen) if self._is_over else dm_env.transition(reward, seen)
+
+    def get_state(self) -> SavedState:
+        """Return a copy of the complete state, for `set_state` of this or an equal environment."""
+        return self.core.get_state()
+
+    def set_state(self, state: SavedState) -> collections.OrderedDict[str, np.ndarray]:
+        """Continue from a saved state, see `MachineEnv.set_state`, and return the observation in this state."""
+        self.core.set_state(state)
+        self._is_started, self._is_over = True, bool(self.core.terminated[0] or self.core.truncated[0])
+        return self._grouped_observation()
 
     def _grouped_observation(self) -> collections.OrderedDict[str, np.ndarray]:
         return split_by_key(self.core.observation[0], self._key_indices)

@@ -447,17 +447,18 @@ class PythonTaskCore(TaskCore):
         self._observe(number, state)
 
     def _observe(self, number: int, state: TaskState) -> None:
-        values = np.asarray(self._program.observe(state), float).ravel()
+        values = np.array(self._program.observe(state), float).ravel()
         low, high = self.observation_low[self._first :], self.observation_high[self._first :]
         if len(values) != len(low):
             raise _make_size_error(self._program.name, len(values), len(low))
         if not np.isfinite(values).all():
             if not self.episodes["fault"][number]:
                 names = [field.name for field in self.setup.fields[self._first :]]
-                message = f"observe returns {values[~np.isfinite(values)][0]} for {names[np.argmin(np.isfinite(values))]}"
+                message = (
+                    f"observe returns {values[~np.isfinite(values)][0]} for {names[np.argmin(np.isfinite(values))]}"
+                )
                 raise InputError(f"task {self._program.name}", message)
             values = np.where(np.isfinite(values), values, low)
         inside = np.clip(values, low, high)
         self.episodes["saturated"][number] += int((inside != values).sum())
         self.observation[number, self._first :] = inside
-

@@ -48,6 +48,9 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     task, options, plant = setup.task, setup.options, setup.variants.plant
     if options.action not in ACTIONS:
         raise InputError(f"action {options.action!r}", suggest_valid_name(options.action, ACTIONS))
+    if options.action != "valve" and (pumped := [name for name in setup.axes if setup.machine.axes[name].pump]):
+        message = f"the servo does not control {pumped[0]}, which has its own pump; choose valve"
+        raise InputError(f"action {options.action!r}", message)
     if options.action == "resolved_motion" and not setup.arm_axes:
         raise InputError("action 'resolved_motion'", f"{setup.machine.name} has no arm; choose valve or joint_rate")
     code = task.code or TASK_CODES[task.kind]
