@@ -417,8 +417,8 @@ class PythonTaskCore(TaskCore):
                 self._begin_episode(number)
             elif not was_over[number]:
                 self._finish_step(number)
-        over = np.flatnonzero(self.episodes["over"]) if self._resets_in_step else ()
-        if len(over):
+        over = np.flatnonzero(self.episodes["over"])
+        if self._resets_in_step and len(over):
             self.final_observation[over], self.final_measures[over] = self.observation[over], self.measures[over]
             ends = [array[over] for array in (self.reward, self.terminated, self.truncated)]
             self.reset(None, over)
