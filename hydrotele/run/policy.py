@@ -7,10 +7,11 @@ if the scenario lists its values. An object may have the attributes `action`, `r
 `begin(machine, axes)` that is called before the run.
 """
 
-import importlib.util
+import contextlib
 import json
+import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -151,13 +152,15 @@ def complete_policy_pilot(pilot: PolicyPilot, policy: Policy, machine: Machine, 
 
 
 def _load_stable_baselines(path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    import_torch(f"policy {path}")
-    library = require_library("stable_baselines3", "learn", f"policy {path}")
     name = _find_algorithm(path)
-    try:
-        model = getattr(library, name).load(path, device="cpu")
-    except Exception as error:  # the file holds pickled objects of any kind
-        raise InputError(path, f"cannot be loaded as a policy of {name}: {type(error).__name__}: {error}") from error
+    with _hidden_triton():
+        require_library("torch", "learn", f"policy {path}")
+        library = require_library("stable_baselines3", "learn", f"policy {path}")
+        try:
+            model = getattr(library, name).load(path, device="cpu")
+        except Exception as error:  # the file holds pickled objects of any kind
+            message = f"cannot be loaded as a policy of {name}: {type(error).__name__}: {error}"
+            raise InputError(path, message) from error
     size = model.observation_space.shape
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -182,7 +185,8 @@ def _find_algorithm(path: Path) -> str:
 
 
 def _load_torchscript(path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    torch = import_torch(f"policy {path}")
+    with _hidden_triton():
+        torch = require_library("torch", "learn", f"policy {path}")
     try:
         module = torch.jit.load(path, map_location="cpu").eval()
     except (RuntimeError, ValueError) as error:
@@ -199,15 +203,21 @@ def _load_torchscript(path: Path) -> Callable[[np.ndarray], np.ndarray]:
     return act
 
 
-def import_torch(purpose: str) -> Any:
-    """Import torch.
+@contextlib.contextmanager
+def _hidden_triton() -> Iterator[None]:
+    """Make the library triton appear absent, unless it is loaded already.
 
-    Raises:
-        InputError: it is not installed; the message begins with `purpose`.
+    It contains LLVM. Its import after that of OpenGL, which may contain another LLVM, ends the process.
+    Policies need it on no device.
     """
-    if importlib.util.find_spec("triton"):  # crashes if Mesa's LLVM, which OpenGL loads, comes first
-        require_library("triton", "learn", purpose)
-    return require_library("torch", "learn", purpose)
+    if "triton" in sys.modules:
+        yield
+        return
+    sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - documented: the import then fails
+    try:
+        yield
+    finally:
+        del sys.modules["triton"]
 
 
 def _load_onnx(path: Path) -> Callable[[np.ndarray], np.ndarray]:
