@@ -21,17 +21,21 @@ from typing import Any, NamedTuple
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
 
+PLUGIN_GROUPS = ("hydrotele.effects", "hydrotele.tasks", "hydrotele.pilots", "hydrotele.importers")
+
 
 class Plugin(NamedTuple):
     """An entry point of an installed package.
 
     Attributes:
         name: name of the entry point.
+        package: name of the package.
         source: name and package, for messages.
         entry: the entry point.
     """
 
     name: str
+    package: str
     source: str
     entry: importlib.metadata.EntryPoint
 
@@ -60,7 +64,7 @@ def find_plugins(group: str) -> dict[str, Plugin]:
     found: dict[str, Plugin] = {}
     for entry in importlib.metadata.entry_points(group=group):
         package = entry.dist.name if entry.dist else "?"
-        plugin = Plugin(entry.name, f"plug-in {entry.name} of the package {package}", entry)
+        plugin = Plugin(entry.name, package, f"plug-in {entry.name} of the package {package}", entry)
         known = found.get(entry.name)
         if known and known.entry.value != entry.value:
             message = f"{known.source} has the same name in the group {group}; uninstall one of the packages"
