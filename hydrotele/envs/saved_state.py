@@ -59,9 +59,7 @@ def restore_state(environment: str, live: Mapping[str, np.ndarray], state: Saved
         raise InputError("set_state", _describe_difference(state.environment, environment))
     rows = np.arange(len(live["episodes"])) if index is None else np.atleast_1d(index)
     if len(state) not in (1, len(rows)):
-        raise InputError(
-            "set_state", f"the state has {len(state)} episodes; {len(rows)} are to be set: give 1 or {len(rows)}"
-        )
+        raise InputError("set_state", f"the state has {len(state)} episodes, but {len(rows)} are to be set")
     for name, array in live.items():
         array[rows] = state.arrays[name]
 

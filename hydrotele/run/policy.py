@@ -143,8 +143,10 @@ def complete_policy_pilot(pilot: PolicyPilot, policy: Policy, machine: Machine, 
     plain = {key: list(value) if isinstance(value, tuple | list) else value for key, value in values.items()}
     spec = {"kind": "policy", "policy": pilot.policy, **plain}
     whole = validate_data(PolicyPilot, spec, policy.source, {})
+    if whole.action == "resolved_motion" and not arm:
+        raise InputError("pilot.action", f"{machine.name} has no arm for resolved_motion; use valve or joint_rate")
     if whole.action == "resolved_motion" and whole.axes[: len(arm)] != arm:
-        raise InputError("pilot.axes", f"resolved_motion needs the axes of the arm first: {', '.join(arm) or 'none'}")
+        raise InputError("pilot.axes", f"resolved_motion needs the axes of the arm first: {', '.join(arm)}")
     if policy.needs_observation and not whole.observation:
         message = "say what it observes: `hydrotele run --task TASK` for that of a task, or `pilot.observation`"
         raise InputError(policy.source, message)
