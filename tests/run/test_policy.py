@@ -159,8 +159,9 @@ def test_an_onnx_policy_of_a_task_follows_a_scenario(tmp_path):
     env.close()
     weights = np.zeros((len(names), 3), np.float32)
     for column, axis in enumerate(("swing", "boom", "stick")):
-        weights[names.index(f"reference.{axis}"), column] = 8.0
-        weights[names.index(f"angle.{axis}"), column] = -8.0
+        gain = -4.0 if axis == "stick" else 4.0  # a longer cylinder of the stick reduces the angle
+        weights[names.index(f"reference.{axis}"), column] = gain
+        weights[names.index(f"angle.{axis}"), column] = -gain
     write_onnx(tmp_path / "net.onnx", weights)
     scenario = load_scenario("excitation", {"duration": "3.0", "sensors": "ideal"})
     chosen = with_policy(scenario, PolicyChoice(str(tmp_path / "net.onnx"), "hydrotele/TrackTrajectory-v0"))
@@ -169,9 +170,8 @@ def test_an_onnx_policy_of_a_task_follows_a_scenario(tmp_path):
     closed = with_policy(scenario, PolicyChoice(str(tmp_path / "net.onnx"), "TrackTrajectory"))
     write_onnx(tmp_path / "net.onnx", 0.0 * weights)
     still = run_scenario(closed)
-    for axis in ("swing", "boom", "stick"):
-        errors = [each.summary["tracking"][axis]["rms"] for each in (run, still)]
-        assert errors[0] < 0.7 * errors[1], "the policy tracks the reference, closed valves do not"
+    errors = [sum(one["rms"] for one in each.summary["tracking"].values()) for each in (run, still)]
+    assert errors[0] < 0.6 * errors[1], "the policy tracks the reference, closed valves do not"
     write_onnx(tmp_path / "net.onnx", weights[:7])
     with pytest.raises(InputError, match="needs an observation of 7 values, but 35 are listed"):
         run_scenario(chosen)
@@ -188,33 +188,3 @@ def test_the_task_of_a_trained_policy_is_read_from_its_folder(tmp_path):
     (tmp_path / TRAINING_FILE).write_text("{}")
     with pytest.raises(InputError, match="training.json: is damaged"):
         with_policy(load_scenario("excitation"), PolicyChoice(str(tmp_path / "net.onnx"), None))
-
-
-@pytest.mark.parametrize("kind", ["PPO", "SAC", "TD3", "A2C"])
-def test_files_of_stable_baselines_keep_their_actions(tmp_path, kind):
-    library = pytest.importorskip("stable_baselines3", reason="the extra `learn` is not installed")
-    gymnasium = pytest.importorskip("gymnasium")
-
-    class Small(gymnasium.Env):
-        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
-        action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-
-    model = getattr(library, kind)("MlpPolicy", Small(), seed=0, device="cpu")
-    model.save(tmp_path / "policy.zip")
-    seen = np.array([0.1, -0.2, 0.3, 0.9], np.float32)
-    policy = load_policy("policy.zip", str(tmp_path))
-    assert policy.needs_observation
-    assert np.array_equal(policy.act(seen), model.predict(seen, deterministic=True)[0])
-    with pytest.raises(InputError, match="needs an observation of 4 values"):
-        policy.act(seen[:3])
-
-
-def test_files_of_torchscript_keep_their_actions(tmp_path):
-    torch = pytest.importorskip("torch", reason="the extra `learn` is not installed")
-    layer = torch.nn.Linear(3, 2)
-    torch.jit.script(layer).save(str(tmp_path / "net.pt"))
-    seen = np.array([0.1, -0.2, 0.3], np.float32)
-    policy = load_policy("net.pt", str(tmp_path))
-    assert policy.act(seen) == pytest.approx(layer(torch.from_numpy(seen)).detach().numpy())
-    with pytest.raises(InputError, match="does not accept 2 values"):
-        policy.act(seen[:2])
