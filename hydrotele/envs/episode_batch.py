@@ -13,6 +13,7 @@ import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.control.servo import tabulate_drive_geometry
+from hydrotele.core.datafile import validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode import (
@@ -31,6 +32,7 @@ from hydrotele.envs.task import Options, Task, load_task_machine
 from hydrotele.envs.task_parameters import make_task_parameters
 from hydrotele.envs.task_setup import TaskSetup, make_timing
 from hydrotele.envs.variants import make_variants
+from hydrotele.scenario.scenario import Servo
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.batch import SimulationBatch
 from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
@@ -79,6 +81,9 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
     readings = list_machine_observation_fields(machine, axes, len(arm)) if task.with_readings else []
     fields = [*readings, *task.fields(machine, axes)]
     table = tabulate_drive_geometry(machine, variants.plant.axes)[1]
+    if options.servo:
+        settings = task.servo.model_dump(exclude_unset=True) | options.servo
+        task = dataclasses.replace(task, servo=validate_data(Servo, settings, "environment option 'servo'", {}))
     return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 
 

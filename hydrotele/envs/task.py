@@ -112,6 +112,8 @@ class Options:
         variants: number of random machines and starts; every episode uses one of them.
         variant_seed: seed for drawing the variants.
         timestep: physics step [s].
+        servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
+            `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
     """
 
     machine: str | Path | Machine | None = None
@@ -125,6 +127,7 @@ class Options:
     variants: int = 64
     variant_seed: int = 0
     timestep: float = 1.0e-3
+    servo: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
@@ -183,7 +186,7 @@ def load_task_machine(task: Task, options: Options) -> Machine:
     """Load the machine of a task, or the one that the user chose, with its tool.
 
     Raises:
-        InputError: the machine or tool does not exist, or the machine lacks what the task needs.
+        InputError: the machine or tool does not exist, or the machine has no such arm or axes as the task requires.
     """
     chosen = options.machine
     if isinstance(chosen, Machine):
@@ -203,7 +206,7 @@ def load_task_machine(task: Task, options: Options) -> Machine:
 
 
 def check_task_machine(task: Task, machine: Machine) -> None:
-    """Raise InputError if a machine lacks a joint or an axis that a task needs."""
+    """Raise InputError unless a machine has all joints and axes of `Task.needs` and `Task.extra_axes`."""
     names = machine.joints.keys() | machine.axes.keys()
     missing = [name for name in task.needs if not getattr(machine.arm, name, None) and name not in names]
     missing += [name for name in task.extra_axes if name not in machine.axes]

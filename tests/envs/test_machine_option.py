@@ -39,6 +39,17 @@ def test_another_tool():
     env.close()
 
 
+def test_servo_settings_replace_those_of_the_task():
+    env = MachineEnv("ReachFeller", servo={"axis_gains": {"swing": 0.5}}, variants=1)
+    assert env.core.setup.task.servo.axis_gains == {"swing": 0.5}
+    env.close()
+    env = MachineEnv("HoldForce", servo={"lead": 0.02}, variants=1)
+    assert (env.core.setup.task.servo.lead, env.core.setup.task.servo.position_gain) == (0.02, 5.0)
+    env.close()
+    with pytest.raises(InputError, match="servo.*gain"):
+        MachineEnv("ReachFeller", servo={"gain": 2.0}, variants=1)
+
+
 def test_a_line_for_a_larger_machine_is_longer_and_higher():
     """Lengths follow the reach of the machine; the bounds are those of the CAT 215 times its ratio."""
     small, large = (MachineEnv("StraightLine", machine=name, variants=1) for name in ("cat215", "cat325"))

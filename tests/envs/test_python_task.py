@@ -1,6 +1,8 @@
 """Tasks in plain Python and compiled ones: single and batched alike, and messages for what is wrong."""
 
 import importlib.metadata
+import re
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -252,3 +254,28 @@ def test_plugins_are_tasks_by_name(monkeypatch):
     assert find_task("Level").name == "LevelTip"
     with pytest.raises(InputError, match="plug-in Bad of the package .*3.14 is neither"):
         find_task("Bad")
+
+
+def printed_code(page: str, start: str) -> str:
+    """Return the Python block of a page that begins with a line."""
+    text = (Path(__file__).parents[2] / "docs" / page).read_text(encoding="utf-8")
+    return next(code for code in re.findall(r"```python\n(.*?)```", text, re.S) if code.startswith(start))
+
+
+def test_the_task_of_the_page_runs_as_printed():
+    names: dict = {}
+    exec(printed_code("bring_your_own.md", "import gymnasium\nimport hydrotele as ht"), names)
+    names["env"].reset(seed=0)
+    names["envs"].reset(seed=0)
+    assert np.isfinite(names["env"].step(np.zeros(4))[1])
+    assert np.isfinite(names["envs"].step(np.zeros((64, 4)))[1]).all()
+    names["env"].close()
+    names["envs"].close()
+
+
+def test_the_planning_example_of_the_page_runs_as_printed():
+    names: dict = {}
+    exec(printed_code("train.md", "import gymnasium, numpy, hydrotele.envs\n\nenv ="), names)
+    assert names["returns"].std() > 0.0
+    names["env"].close()
+    names["plans"].close()

@@ -29,13 +29,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000, help="environment steps that are compared")
     steps = parser.parse_args().steps
-    print(f"{'task':<16} {'environments':>12} {'bytes':>6} {'steps':>6} {'ends':>5} {'values':>10} {'different':>9}")
+    print("| task | environments | state [bytes] | steps | ends of episodes | values compared | different |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     failed = 0
     for name in hydrotele.envs.TASK_NAMES:
         for count in (1, 4):
             size, resets, values, different = compare_runs(name, count, steps)
             failed += different
-            print(f"{name:<16} {count:>12} {size:>6} {steps:>6} {resets:>5} {values:>10} {different:>9}", flush=True)
+            print(f"| {name} | {count} | {size:,} | {steps:,} | {resets} | {values:,} | {different} |", flush=True)
     raise SystemExit(1 if failed else 0)
 
 
