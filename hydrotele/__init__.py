@@ -46,7 +46,7 @@ _PUBLIC = {
     "logs.log": ("Log", "load_log", "load_logs", "save_log"),
     "machine.machine": ("Machine",),
     "machine.machine_file": ("load_machine", "save_machine", "shipped_machines"),
-    "run.policy": ("PilotState",),
+    "run.policy": ("PilotState", "allow_policy"),
     "run.replay": ("Replay", "replay_log"),
     "run.run": ("Run", "run_scenario"),
     "scenario.scenario": ("Scenario", "load_scenario", "shipped_scenarios"),

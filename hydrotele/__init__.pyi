@@ -19,7 +19,7 @@ from .logs.dataset import Dataset, load_dataset
 from .logs.log import Log, load_log, load_logs, save_log
 from .machine.machine import Machine
 from .machine.machine_file import load_machine, save_machine, shipped_machines
-from .run.policy import PilotState
+from .run.policy import PilotState, allow_policy
 from .run.replay import Replay, replay_log
 from .run.run import Run, run_scenario
 from .scenario.scenario import Scenario, load_scenario, shipped_scenarios
@@ -29,7 +29,7 @@ __version__: str
 __all__ = [
     "Dataset", "EFFECTS", "Gap", "Importer", "InputError", "Log", "Machine", "ObservationField",
     "PilotState", "Plant", "PythonTask", "Recording", "Replay", "Run", "Scenario", "TaskState",
-    "apply_effect", "build_plant", "compiled", "draw_uniform", "draw_uniform_between",
+    "allow_policy", "apply_effect", "build_plant", "compiled", "draw_uniform", "draw_uniform_between",
     "endpoint_force_of_log", "find_gap", "gap_document", "identify_dynamics",
     "identify_gravity", "initial_state", "load_dataset", "load_effects", "load_log",
     "load_logs", "load_machine", "load_scenario", "make_controller", "make_recording",

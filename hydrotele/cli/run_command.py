@@ -27,6 +27,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import save_machine
+from hydrotele.run.policy import allow_policy
 from hydrotele.run.run import Run, load_nominal_machine, run_scenario
 from hydrotele.run.sweep import Progress, SweepResult, SweepSettings, run_sweep
 from hydrotele.run.sweep_file import SweepFile, load_sweep
@@ -99,7 +100,7 @@ _TASK_ID = re.compile(r"(?:hydrotele/)?(.+?)(?:-v\d+)?")
 def with_policy(scenario: Scenario, choice: PolicyChoice) -> Scenario:
     """Return a scenario whose pilot is a policy; the motion of the former pilot is the reference to follow.
 
-    Without a task, observation and actions are those that `hydrotele train` stored next to the policy.
+    The policy is allowed to run code. If the pilot is a policy already, its other keys are kept. Without a task, observation and actions are those that `hydrotele train` stored next to the policy.
 
     Raises:
         InputError: the task does not exist, or does not fit the machine of the scenario.
@@ -108,8 +109,11 @@ def with_policy(scenario: Scenario, choice: PolicyChoice) -> Scenario:
     place, colon, name = path.rpartition(":")
     if (file := Path(place if colon else name)).is_file():
         path = f"{file.resolve()}{colon}{name if colon else ''}"
-    reference = old.reference if isinstance(old, PolicyPilot) else None if isinstance(old, TeleopPilot) else old
-    pilot = PolicyPilot(kind="policy", policy=path, reference=reference)
+    allow_policy(path)
+    if isinstance(old, PolicyPilot):
+        pilot = old.model_copy(update={"policy": path})
+    else:
+        pilot = PolicyPilot(kind="policy", policy=path, reference=None if isinstance(old, TeleopPilot) else old)
     task, options = choice.task, {}
     stored = Path(path).with_name(TRAINING_FILE)
     if task is None and stored.is_file() and Path(path).is_file():

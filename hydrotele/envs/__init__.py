@@ -22,7 +22,7 @@ TASK_NAMES = (
 )  # fmt: skip
 
 
-def _register(name: str, **kwargs: str) -> None:
+def _register(name: str, **kwargs: str | None) -> None:
     register(
         id=f"hydrotele/{name}-v0",
         entry_point="hydrotele.envs.gymnasium_env:MachineEnv",
@@ -33,7 +33,7 @@ def _register(name: str, **kwargs: str) -> None:
 
 for _name in TASK_NAMES:
     _register(_name, task=_name)
-_register("Custom")  # its task is an argument of `make`
+_register("Custom", task=None)  # its task is an argument of `make`
 for _plugin in find_plugins(PLUGIN_GROUP).values():
     if _plugin.name in (*TASK_NAMES, "Custom"):
         raise InputError(_plugin.source, f"task {_plugin.name} exists already; choose another name")

@@ -203,6 +203,10 @@ class PythonTask:
         """Return whether the episode ends in this state; it is called after `reward`."""
         return False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes without the converted task, which cannot be copied, for `copy` and `pickle`."""
+        return {name: value for name, value in vars(self).items() if name != "_task"}
+
     def __repr__(self) -> str:
         """Return the name."""
         return f"PythonTask {self.name}"

@@ -52,6 +52,8 @@ def find_task(task: str | Task | type | Any) -> Task:
     """
     if isinstance(task, Task):
         return task
+    if task is None:
+        raise InputError("hydrotele/Custom-v0", "needs a task: gymnasium.make('hydrotele/Custom-v0', task=MyTask)")
     if not isinstance(task, str):
         return find_python_task(task)
     if task in TASKS:

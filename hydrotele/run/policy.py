@@ -21,6 +21,7 @@ from hydrotele.control.action_limits import POSE_RATES
 from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.core.datafile import suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.core.plugins import find_plugins, is_object_reference, load_object, require_library
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.pilots import PolicyPilot
@@ -76,6 +77,42 @@ class Policy(NamedTuple):
     needs_observation: bool
     begin: Callable[[Machine, tuple[str, ...]], object] | None = None
     defaults: dict[str, Any] = {}  # noqa: RUF012
+
+
+_ALLOWED: set[str] = set()
+
+
+def allow_policy(name: str, folder: str = "") -> None:
+    """Allow scenario files to use a program that can run code: a Python function, or a `.zip` or `.pt` file.
+
+    `hydrotele run --policy` does this for the program that it names. A scenario file alone cannot: it may
+    come from somebody else.
+
+    Args:
+        name: as for `load_policy`.
+        folder: folder to which a file is relative.
+    """
+    _ALLOWED.add(_absolute_name(name, folder))
+
+
+def _absolute_name(name: str, folder: str) -> str:
+    place, colon, end = name.rpartition(":")
+    path = Path(folder, place if colon else end)
+    return f"{resolve_path(path)}{colon}{end if colon else ''}" if path.is_file() else name
+
+
+def check_policy_is_allowed(name: str, folder: str) -> None:
+    """Raise InputError if a scenario file names a program that can run code and that the user has not allowed.
+
+    `folder` is that of the file, empty for a scenario made in Python.
+    """
+    can_run_code = name.endswith((".zip", ".pt")) or is_object_reference(name)
+    if folder and can_run_code and _absolute_name(name, folder) not in _ALLOWED:
+        message = (
+            f"the scenario file names {name}, which can run any code with your rights: if you trust it, give"
+            f" --policy {_absolute_name(name, folder)} on the command line, or call hydrotele.allow_policy in Python"
+        )
+        raise InputError("pilot.policy", message)
 
 
 def load_policy(name: str, folder: str = "") -> Policy:

@@ -30,7 +30,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.oil_temperature import with_oil_temperature
-from hydrotele.run.policy import complete_policy_pilot, load_policy
+from hydrotele.run.policy import check_policy_is_allowed, complete_policy_pilot, load_policy
 from hydrotele.run.session import PreparedRun, Session
 from hydrotele.run.tick_loop import (
     start_background_compilation,
@@ -244,6 +244,7 @@ def prepare_run(scenario: Scenario) -> PreparedRun:
     times = np.arange(scenario.tick_count) / scenario.control_rate
     policy, pilot = None, scenario.pilot
     if isinstance(pilot, PolicyPilot):
+        check_policy_is_allowed(pilot.policy, scenario.folder)
         program = load_policy(pilot.policy, scenario.folder)
         pilot = complete_policy_pilot(pilot, program, machine, plant.axes)
         policy = program, pilot

@@ -240,8 +240,13 @@ def test_what_is_wrong_is_said():
         with pytest.raises(InputError, match=said):
             env.reset(seed=0)
         env.close()
-    env = MachineEnv(Argument(2.0), **OPTIONS)  # an object needs no default
-    env.close()
+    with pytest.raises(InputError, match="task=MyTask"):
+        gymnasium.make(CUSTOM)
+    for program in (Argument(2.0), LevelTipCompiled()):  # an object needs no default; gymnasium copies it
+        for _ in range(2):
+            env = gymnasium.make(CUSTOM, task=program, **OPTIONS)
+            env.reset(seed=0)
+            env.close()
 
 
 def test_plugins_are_tasks_by_name(monkeypatch):

@@ -11,8 +11,8 @@ import pytest
 from hydrotele.cli.run_command import TRAINING_FILE, PolicyChoice, with_policy
 from hydrotele.core.errors import InputError
 from hydrotele.envs.gymnasium_env import MachineEnv
-from hydrotele.run.policy import load_policy
-from hydrotele.run.run import run_scenario
+from hydrotele.run.policy import allow_policy, load_policy
+from hydrotele.run.run import prepare_run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario
 
 ACTIONS = ("valve", "joint_rate", "resolved_motion")
@@ -25,6 +25,7 @@ def write_policy(folder: Path, text: str, name: str = "mine.py") -> None:
 
 def rig_scenario(folder: Path, **pilot) -> Scenario:
     spec = {"kind": "policy", "policy": "mine.py:act", **pilot}
+    allow_policy("mine.py:act", str(folder))
     return Scenario.model_validate({**RIG, "folder": str(folder), "pilot": spec})
 
 
@@ -124,6 +125,26 @@ def test_what_is_wrong_is_said(tmp_path, text, pilot, said):
     write_policy(tmp_path, text)
     with pytest.raises(InputError, match=said):
         run_scenario(rig_scenario(tmp_path, **pilot))
+
+
+def test_a_scenario_file_alone_cannot_run_code(tmp_path, monkeypatch):
+    """Neither run nor validate: the file may be somebody else's. Naming the program allows it and keeps the keys."""
+    monkeypatch.chdir(tmp_path)
+    write_policy(tmp_path, "open('executed', 'w').close()\ndef act(s):\n    return [0.1]\n", "other.py")
+    text = (
+        "{name: t, machine: rig, duration: 1.0, ground: false, pilot: {kind: policy, policy: 'other.py:act', rate: 20}}"
+    )
+    (tmp_path / "s.yaml").write_text(text)
+    scenario = load_scenario(tmp_path / "s.yaml")
+    for name in ("other.py:act", "x.zip", "x.pt", "json:loads"):
+        pilot = scenario.pilot.model_copy(update={"policy": name})
+        with pytest.raises(InputError, match="can run any code.*--policy"):
+            prepare_run(scenario.model_copy(update={"pilot": pilot}))
+    assert not (tmp_path / "executed").exists()
+    chosen = with_policy(scenario, PolicyChoice(str(tmp_path / "other.py") + ":act", None))
+    assert chosen.pilot.rate == 20.0
+    prepare_run(chosen)
+    assert (tmp_path / "executed").exists()
 
 
 def test_unusable_files_are_refused(tmp_path):
