@@ -100,7 +100,8 @@ _TASK_ID = re.compile(r"(?:hydrotele/)?(.+?)(?:-v\d+)?")
 def with_policy(scenario: Scenario, choice: PolicyChoice) -> Scenario:
     """Return a scenario whose pilot is a policy; the motion of the former pilot is the reference to follow.
 
-    The policy is allowed to run code. If the pilot is a policy already, its other keys are kept. Without a task, observation and actions are those that `hydrotele train` stored next to the policy.
+    The policy is allowed to run code. If the pilot is a policy already, its other keys are kept. Without a task,
+    observation and actions are those that `hydrotele train` stored next to the policy.
 
     Raises:
         InputError: the task does not exist, or does not fit the machine of the scenario.
