@@ -10,7 +10,8 @@ from hydrotele.machine.joystick import load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import find_machine_file, load_machine, shipped_machines
 
 _DESCRIPTIONS = ("description", "what")  # keys of the text that describes an item
-_KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments", "plugins")
+_KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
+_PLUGINS = "plugins"  # a kind that is listed on request only: its items are among those of the other kinds
 
 
 def list_items(item_kind: str | None, as_json: bool) -> None:
@@ -24,9 +25,9 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
     Raises:
         InputError: `item_kind` is not a valid kind.
     """
-    if item_kind not in (None, *_KINDS, "all"):
-        raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, "all"]))
-    wanted = (item_kind,) if item_kind in _KINDS else _KINDS
+    if item_kind not in (None, *_KINDS, _PLUGINS, "all"):
+        raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, _PLUGINS, "all"]))
+    wanted = (item_kind,) if item_kind in (*_KINDS, _PLUGINS) else _KINDS
     tables = {
         "machines": _machine_rows, "joysticks": _joystick_rows, "scenarios": _scenario_rows,
         "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows, "plugins": _plugin_rows,
@@ -36,7 +37,7 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
         return
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
-        print_json(data[item_kind] if item_kind in _KINDS else data)
+        print_json(data[item_kind] if item_kind in data else data)
         return
     print("\n\n".join(format_items(kind, rows, stdout_console.width) for kind, rows in data.items()))
 
@@ -84,7 +85,7 @@ def format_items(kind: str, rows: list[dict], width: int) -> str:
     """
     indent = min(max((len(row["name"]) for row in rows), default=0) + 4, max(4, width - _MIN_TEXT_WIDTH))
     blank = " " * indent
-    lines = [f"{kind}:"]
+    lines = [f"{kind}:" if rows else f"{kind}: none"]
     for row in rows:
         head = f"  {row['name']}"
         keys = sorted(row.keys() - {"name"}, key=lambda key: (key not in _DESCRIPTIONS, list(row).index(key)))
@@ -129,7 +130,6 @@ def _item_names(kind: str) -> list[str]:
         "machines": shipped_machines, "joysticks": shipped_joysticks, "scenarios": shipped_scenarios,
         "sweeps": shipped_sweeps, "effects": lambda: list(EFFECTS),
         "environments": lambda: [f"hydrotele/{name}-v0" for name in [*TASKS, *find_plugins("hydrotele.tasks")]],
-        "plugins": lambda: [plugin.name for group in PLUGIN_GROUPS for plugin in find_plugins(group).values()],
     }  # fmt: skip
     return list(names[kind]())
 

@@ -632,7 +632,7 @@ def list_(
     what: Annotated[
         str | None,
         typer.Argument(
-            help="machines, joysticks, scenarios, sweeps, effects, environments or all, with their"
+            help="machines, joysticks, scenarios, sweeps, effects, environments, plugins or all, with their"
             " descriptions; default: the names only."
         ),
     ] = None,
