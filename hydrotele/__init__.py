@@ -35,6 +35,7 @@ _ignore_local_configuration_files()
 _PUBLIC = {
     "control.endpoint_force": ("endpoint_force_of_log",),
     "control.gravity_model": ("identify_gravity",),
+    "core.compiled": ("compiled",),
     "core.errors": ("InputError",),
     "effects": ("EFFECTS", "apply_effect", "load_effects"),
     "estimate.linear_model": ("LinearModel", "linearise"),
@@ -46,11 +47,17 @@ _PUBLIC = {
     "logs.log": ("Log", "load_log", "load_logs", "save_log"),
     "machine.machine": ("Machine",),
     "machine.machine_file": ("load_machine", "save_machine", "shipped_machines"),
+    "run.policy": ("PilotState", "allow_policy"),
     "run.replay": ("Replay", "replay_log"),
     "run.run": ("Run", "run_scenario"),
     "scenario.scenario": ("Scenario", "load_scenario", "shipped_scenarios"),
     "simulate.plant": ("Plant", "build_plant", "initial_state", "rest_state"),
     "envs.controllers.catalogue": ("make_controller",),
+    "envs.episode": ("draw_uniform", "draw_uniform_between"),
+    "envs.observation": ("ObservationField",),
+    "envs.python_task": ("PythonTask", "TaskState"),
+    "importers.plugin_importers": ("Importer", "make_recording"),
+    "importers.recordings": ("Recording",),
 }
 _MODULE = {name: module for module, names in _PUBLIC.items() for name in names}
 __all__ = sorted(_MODULE)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -1,19 +1,21 @@
-"""Implement `hydrotele list`: show the available machines, joysticks, scenarios, sweeps, effects and environments."""
+"""Implement `hydrotele list`: machines, joysticks, scenarios, sweeps, effects, environments and plug-ins."""
 
 from textwrap import wrap
 
 from hydrotele.cli.console import print_json, stdout_console
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.core.plugins import PLUGIN_GROUPS, find_plugins
 from hydrotele.machine.joystick import load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import find_machine_file, load_machine, shipped_machines
 
 _DESCRIPTIONS = ("description", "what")  # keys of the text that describes an item
 _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
+_PLUGINS = "plugins"  # a kind that is listed on request only: its items are among those of the other kinds
 
 
 def list_items(item_kind: str | None, as_json: bool) -> None:
-    """Print the available machines, joysticks, scenarios, sweeps, effects or environments.
+    """Print the available machines, joysticks, scenarios, sweeps, effects, environments or plug-ins.
 
     Args:
         item_kind: kind of the items, such as `machines`; `all` for all kinds; None for a summary
@@ -23,19 +25,19 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
     Raises:
         InputError: `item_kind` is not a valid kind.
     """
-    if item_kind not in (None, *_KINDS, "all"):
-        raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, "all"]))
-    wanted = (item_kind,) if item_kind in _KINDS else _KINDS
+    if item_kind not in (None, *_KINDS, _PLUGINS, "all"):
+        raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, _PLUGINS, "all"]))
+    wanted = (item_kind,) if item_kind in (*_KINDS, _PLUGINS) else _KINDS
     tables = {
         "machines": _machine_rows, "joysticks": _joystick_rows, "scenarios": _scenario_rows,
-        "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows,
+        "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows, "plugins": _plugin_rows,
     }  # fmt: skip
     if item_kind is None and not as_json:
         print(format_name_lists({kind: _item_names(kind) for kind in _KINDS}, stdout_console.width))
         return
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
-        print_json(data[item_kind] if item_kind in _KINDS else data)
+        print_json(data[item_kind] if item_kind in data else data)
         return
     print("\n\n".join(format_items(kind, rows, stdout_console.width) for kind, rows in data.items()))
 
@@ -83,7 +85,7 @@ def format_items(kind: str, rows: list[dict], width: int) -> str:
     """
     indent = min(max((len(row["name"]) for row in rows), default=0) + 4, max(4, width - _MIN_TEXT_WIDTH))
     blank = " " * indent
-    lines = [f"{kind}:"]
+    lines = [f"{kind}:" if rows else f"{kind}: none"]
     for row in rows:
         head = f"  {row['name']}"
         keys = sorted(row.keys() - {"name"}, key=lambda key: (key not in _DESCRIPTIONS, list(row).index(key)))
@@ -127,7 +129,7 @@ def _item_names(kind: str) -> list[str]:
     names = {
         "machines": shipped_machines, "joysticks": shipped_joysticks, "scenarios": shipped_scenarios,
         "sweeps": shipped_sweeps, "effects": lambda: list(EFFECTS),
-        "environments": lambda: [f"hydrotele/{task.name}-v0" for task in TASKS.values()],
+        "environments": lambda: [f"hydrotele/{name}-v0" for name in [*TASKS, *find_plugins("hydrotele.tasks")]],
     }  # fmt: skip
     return list(names[kind]())
 
@@ -207,14 +209,25 @@ def _effect_rows() -> list[dict]:
 
 def _environment_rows() -> list[dict]:
     """Return a row for each gymnasium environment: name, machine with tool, description and reward."""
-    from hydrotele.envs.task_catalogue import TASKS
+    from hydrotele.envs.task_catalogue import TASKS, find_task
 
+    rows = []
+    for name in [*TASKS, *find_plugins("hydrotele.tasks")]:
+        try:
+            task = find_task(name)
+        except InputError as error:
+            rows.append({"name": f"hydrotele/{name}-v0", "description": str(error)})
+            continue
+        tool = f"{task.machine}, {task.tool or 'its first tool'}"
+        rows.append({"name": f"hydrotele/{name}-v0", "machine": tool, "description": task.description})
+        rows[-1]["reward"] = task.reward
+    return rows
+
+
+def _plugin_rows() -> list[dict]:
+    """Return a row for each plug-in of an installed package: name, group, package and object."""
+    plugins = [(group, plugin) for group in PLUGIN_GROUPS for plugin in find_plugins(group).values()]
     return [
-        {
-            "name": f"hydrotele/{task.name}-v0",
-            "machine": f"{task.machine}, {task.tool or 'its first tool'}",
-            "description": task.description,
-            "reward": task.reward,
-        }
-        for task in TASKS.values()
+        {"name": plugin.name, "group": group, "package": plugin.package, "object": plugin.entry.value}
+        for group, plugin in plugins
     ]

@@ -294,13 +294,27 @@ def run(
     ] = None,
     tool: ToolOption = None,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            "--policy",
+            help="Policy that replaces the pilot: a file (.zip, .pt, .onnx), MODULE:FUNCTION, FILE.py:FUNCTION or a"
+            " plug-in. It follows the motion of the pilot, and runs with your rights: use only files that you trust.",
+        ),
+    ] = None,
+    task: Annotated[
+        str | None, typer.Option("--task", help="Task with whose observation and actions the policy was trained.")
+    ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
     """Simulate a scenario; write logs, a rerun recording, a summary and the MJCF."""
-    from hydrotele.cli.run_command import run_to_folder
+    from hydrotele.cli.run_command import PolicyChoice, run_to_folder
 
-    run_to_folder(scenario, out, parse_overrides(set_ or []) | machine_overrides(machine, tool), review, json)
+    if task and not policy:
+        raise InputError("--task", "needs --policy")
+    overrides = parse_overrides(set_ or []) | machine_overrides(machine, tool)
+    run_to_folder(scenario, out, overrides, review, json, PolicyChoice(policy, task) if policy else None)
 
 
 app.command(epilog=DRIVE_EPILOG)(drive)
@@ -637,7 +651,7 @@ def list_(
     what: Annotated[
         str | None,
         typer.Argument(
-            help="machines, joysticks, scenarios, sweeps, effects, environments or all, with their"
+            help="machines, joysticks, scenarios, sweeps, effects, environments, plugins or all, with their"
             " descriptions; default: the names only."
         ),
     ] = None,

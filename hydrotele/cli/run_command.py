@@ -5,6 +5,8 @@ followed by a replay.
 """
 
 import contextlib
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,17 +27,35 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import save_machine
+from hydrotele.run.policy import allow_policy
 from hydrotele.run.run import Run, load_nominal_machine, run_scenario
 from hydrotele.run.sweep import Progress, SweepResult, SweepSettings, run_sweep
 from hydrotele.run.sweep_file import SweepFile, load_sweep
 from hydrotele.run.sweep_journal import JOURNAL, JournalEntry, count_finished_runs
 from hydrotele.run.sweep_table import choose_plotted_numbers, compute_statistics
-from hydrotele.scenario.scenario import load_scenario, save_scenario
+from hydrotele.scenario.pilots import PolicyPilot
+from hydrotele.scenario.scenario import Scenario, Servo, load_scenario, save_scenario
+from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.show.sweep_report import Study, write_sweep_report
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 
 
-def run_to_folder(name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool) -> Path:
+class PolicyChoice(NamedTuple):
+    """The policy that replaces the pilot of a scenario.
+
+    Attributes:
+        policy: file, `module:function`, `FILE.py:function`, or name of a plug-in.
+        task: task whose observation and actions the policy has, None for those of the file or the program.
+    """
+
+    policy: str
+    task: str | None
+
+
+def run_to_folder(
+    name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool,
+    choice: PolicyChoice | None = None,
+) -> Path:  # fmt: skip
     """Simulate a scenario, write the results to a folder and print a summary.
 
     The output folder is written completely or not at all.
@@ -46,16 +66,19 @@ def run_to_folder(name: str, target: Path | None, overrides: dict[str, str], rev
         overrides: scenario overrides, {key path: YAML text}.
         review: whether to write the rerun recording.
         as_json: print the summary as JSON instead of a table.
+        choice: policy that replaces the pilot of the scenario, None for that pilot.
 
     Returns:
         The output folder.
 
     Raises:
-        InputError: scenario, machine or target are not usable.
+        InputError: scenario, policy, machine or target are not usable.
         SimulationFailed: the state of the simulation is no longer finite.
     """
     stop_profiling_clock()
     scenario = load_scenario(name, overrides)
+    if choice:
+        scenario = with_policy(scenario, choice)
     target = target or Path("runs", scenario.name)
     check_output_folder(target, "run")
     with show_simulation_progress(f"run {scenario.name}", quiet=as_json) as progress:
@@ -68,6 +91,56 @@ def run_to_folder(name: str, target: Path | None, overrides: dict[str, str], rev
         print_summary(result.summary)
         stdout_console.print(f"written to [bold]{target}[/]")
     return target
+
+
+TRAINING_FILE = "training.json"  # of `hydrotele train`, in the folder of the policy
+_TASK_ID = re.compile(r"(?:hydrotele/)?(.+?)(?:-v\d+)?")
+
+
+def with_policy(scenario: Scenario, choice: PolicyChoice) -> Scenario:
+    """Return a scenario whose pilot is a policy; the motion of the former pilot is the reference to follow.
+
+    The policy is allowed to run code. If the pilot is a policy already, its other keys are kept. Without a task,
+    observation and actions are those that `hydrotele train` stored next to the policy.
+
+    Raises:
+        InputError: the task does not exist, or does not fit the machine of the scenario.
+    """
+    old, path = scenario.pilot, choice.policy
+    place, colon, name = path.rpartition(":")
+    if (file := Path(place if colon else name)).is_file():
+        path = f"{file.resolve()}{colon}{name if colon else ''}"
+    allow_policy(path)
+    if isinstance(old, PolicyPilot):
+        pilot = old.model_copy(update={"policy": path})
+    else:
+        pilot = PolicyPilot(kind="policy", policy=path, reference=None if isinstance(old, TeleopPilot) else old)
+    task, options = choice.task, {}
+    stored = Path(path).with_name(TRAINING_FILE)
+    if task is None and stored.is_file() and Path(path).is_file():
+        try:
+            plan = json.loads(stored.read_text(encoding="utf-8"))["plan"]
+            task, options = str(plan["task"]), {k: plan["options"][k] for k in _KEPT_OPTIONS if k in plan["options"]}
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(stored, f"is damaged ({error}); give --task TASK") from None
+    if task is None:
+        return scenario.model_copy(update={"pilot": pilot})
+    from hydrotele.envs.episode_batch import make_task_setup
+    from hydrotele.envs.task import Options
+    from hydrotele.envs.task_catalogue import find_task
+
+    found = _TASK_ID.fullmatch(task)
+    machine = load_nominal_machine(scenario)
+    setup = make_task_setup(find_task(found[1] if found else task), Options(variants=1, machine=machine, **options))
+    pilot = pilot.model_copy(update={
+        "observation": tuple(field.name for field in setup.fields), "axes": setup.axes, "action": setup.options.action,
+        "rate": setup.options.control_rate, "pose_rates": tuple(setup.task.pose_rates),
+    })  # fmt: skip
+    servo = setup.task.servo if scenario.servo == Servo() else scenario.servo
+    return scenario.model_copy(update={"pilot": pilot, "servo": servo})
+
+
+_KEPT_OPTIONS = ("action", "control_rate")
 
 
 def write_run(result: Run, folder: Path, review: bool = True) -> None:

@@ -20,6 +20,7 @@ from hydrotele.scenario.pilots import (
     FourierPilot,
     LinesPilot,
     Pilot,
+    PolicyPilot,
     TablePilot,
     TipMove,
     Waypoint,
@@ -106,6 +107,8 @@ class Plan:
         pose: (n, 4 or 5) reference r [m], theta [rad], z [m], attitude [rad] and head angle [rad]
             of the tip; None if the pilot has no tip motion.
         notes: sentences about motions that cannot be followed.
+        goal: (n, k) positions that a policy is to follow [rad] or [m], None without a policy or reference.
+        goal_rate: (n, k) their rates [rad/s] or [m/s], None likewise.
     """
 
     time: np.ndarray
@@ -116,6 +119,8 @@ class Plan:
     closed_loop: np.ndarray
     pose: np.ndarray | None = None
     notes: tuple[str, ...] = ()
+    goal: np.ndarray | None = None
+    goal_rate: np.ndarray | None = None
 
 
 def make_plan(machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray) -> Plan:
@@ -165,6 +170,25 @@ def _build_plan(
             return _plan_waypoints(plan, machine, pilot)
         case TeleopPilot():
             return _plan_teleoperation(plan, machine, pilot)
+        case PolicyPilot():
+            return _plan_policy(plan, machine, pilot, start)
+
+
+def _plan_policy(plan: Plan, machine: Machine, pilot: PolicyPilot, start: dict[str, float]) -> Plan:
+    """Return the plan of a run with a policy: arrays for its commands or references, and the reference to follow.
+
+    The axes that the policy does not drive keep their commands: their valves stay closed.
+    """
+    driven = [_find_column(plan.axes, name, "pilot.axes") for name in pilot.axes] or list(range(len(plan.axes)))
+    closed = np.zeros(len(plan.axes), bool)
+    closed[driven] = pilot.action in ("joint_rate", "resolved_motion")
+    plan = dataclasses.replace(plan, closed_loop=closed)
+    if pilot.reference is None:
+        return plan
+    goal = make_plan(machine, plan.axes, pilot.reference, start, plan.time)
+    if not goal.closed_loop.any():  # commands are no reference
+        return plan
+    return dataclasses.replace(plan, pose=goal.pose, notes=goal.notes, goal=goal.reference, goal_rate=goal.rate)
 
 
 def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:

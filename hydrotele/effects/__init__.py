@@ -24,7 +24,6 @@ installed packages provide them as entry points of the group `hydrotele.effects`
 
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import math
 import os
@@ -39,6 +38,7 @@ from typing import Any
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_bytes, resolve_path
+from hydrotele.core.plugins import describe_exception, find_plugins
 from hydrotele.effects.effect import Effect, Parameter, term_parameter, with_terms, with_value
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.drive_state import DriveState
@@ -112,7 +112,7 @@ def _execute_file(path: Path, digest: str) -> tuple[Any, ...]:
         raise
     except (Exception, SystemExit) as error:  # any error of the user's code, also exit()
         del sys.modules[name]
-        found = locate_error_in_effect_file(error) or InputError(path, _describe_exception(error))
+        found = locate_error_in_effect_file(error) or InputError(path, describe_exception(error))
         raise InputError(found.where, f"cannot be run: {found.message}") from error
 
 
@@ -130,17 +130,13 @@ def locate_error_in_effect_file(error: BaseException) -> InputError | None:
         only. None if no effect file raised the exception or called the function that raised it.
     """
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _effect_files]
-    message = _describe_exception(error)
+    message = describe_exception(error)
     if isinstance(error, SyntaxError) and error.filename in _effect_files:
         return InputError(f"{_effect_files[error.filename]}:{error.lineno}", message)
     if not frames:
         return None
     path = _effect_files[frames[-1].filename]
     return InputError(f"{path}:{frames[-1].lineno}", f"{message}\n{''.join(traceback.format_list(frames)).rstrip()}")
-
-
-def _describe_exception(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 def _collect_effects(content: Any) -> tuple[Any, ...]:
@@ -187,16 +183,10 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
     Raises:
         InputError: an entry point cannot be loaded; the message names the package.
     """
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
-        package = entry.dist.name if entry.dist else "?"
-        where = f"plug-in {entry.name} of the package {package}"
-        with LawSource(where):
-            try:
-                content = entry.load()
-            except (Exception, SystemExit) as error:  # any error of the package's code
-                message = f"cannot be loaded: {_describe_exception(error)}; update or uninstall the package"
-                raise InputError(where, message) from error
-        _add_to_library(library, _collect_effects(content), where)
+    for plugin in find_plugins(ENTRY_POINT_GROUP).values():
+        with LawSource(plugin.source):
+            content = plugin.load()
+        _add_to_library(library, _collect_effects(content), plugin.source)
 
 
 def add_effects_from_environment_variable(library: dict[str, Effect]) -> None:

@@ -17,19 +17,20 @@ from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.gymnasium_env import make_info
 from hydrotele.envs.observation import ObservationField
 from hydrotele.envs.rendering import FREE_CAMERA, Camera, TaskRenderer
+from hydrotele.envs.saved_state import SavedState
 from hydrotele.envs.task_catalogue import make_task_core
 
 FLAT_KEY = "observations"  # dm_control's key for a flat observation
 
 
 def load(
-    task_name: str, random: int | np.random.RandomState | None = None,
+    task_name: Any, random: int | np.random.RandomState | None = None,
     flat_observation: bool = False, **options: Any,
 ) -> "MachineEnvironment":  # fmt: skip
     """Make an environment, as `dm_control.suite.load` does.
 
     Args:
-        task_name: a name in `hydrotele.envs.task_catalogue.TASKS`.
+        task_name: name of a task, or a class or object of `PythonTask`.
         random: seed of the episodes, or a random state from which a seed is drawn; None uses a seed
             from the operating system.
         flat_observation: whether to return all observations as one array under the key
@@ -60,7 +61,7 @@ class MachineEnvironment(dm_env.Environment):
     """
 
     def __init__(
-        self, task_name: str, random: int | np.random.RandomState | None, flat: bool,
+        self, task_name: Any, random: int | np.random.RandomState | None, flat: bool,
         options: Mapping[str, Any],
     ) -> None:  # fmt: skip
         """Create the environment and compile the machine variants.
@@ -113,6 +114,16 @@ class MachineEnvironment(dm_env.Environment):
         if core.terminated[0]:
             return dm_env.termination(reward, seen)
         return dm_env.truncation(reward, seen) if self._is_over else dm_env.transition(reward, seen)
+
+    def get_state(self) -> SavedState:
+        """Return a copy of the complete state, for `set_state` of this or an equal environment."""
+        return self.core.get_state()
+
+    def set_state(self, state: SavedState) -> collections.OrderedDict[str, np.ndarray]:
+        """Continue from a saved state, see `MachineEnv.set_state`, and return the observation in this state."""
+        self.core.set_state(state)
+        self._is_started, self._is_over = True, bool(self.core.terminated[0] or self.core.truncated[0])
+        return self._grouped_observation()
 
     def _grouped_observation(self) -> collections.OrderedDict[str, np.ndarray]:
         return split_by_key(self.core.observation[0], self._key_indices)

@@ -13,7 +13,7 @@ import numpy as np
 from numba import carray, types
 
 from hydrotele.control.control_loop import Controller, TickReference, control_tick
-from hydrotele.control.resolved_motion import step_references_to_pose
+from hydrotele.control.rate_references import ArmLimits, advance_joint_reference, advance_pose_reference
 from hydrotele.control.servo import (
     TABLE_POINTS,
     ComputedForce,
@@ -63,8 +63,6 @@ from hydrotele.simulate.stepping import (
     true_sensor_values,
 )
 
-_MAX_REFERENCE_LEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
-
 
 @compiled
 def _clip_action(f, action, a):
@@ -73,57 +71,28 @@ def _clip_action(f, action, a):
 
 
 @compiled
-def _limit_change(now, goal, change):
-    return min(now + change, max(now - change, goal))
-
-
-@compiled
 def _integrate_joint_rates(f, e, action, first):
-    """Integrate rate actions over one control period to the joint references of the servo.
-
-    The actions from index `first` on are used. Acceleration, joint range and the lead of the
-    reference over the measured joint are limited; at the limits of range or lead, the reference
-    rate becomes 0.
-    """
+    """Integrate rate actions, from index `first` on, over one control period to the joint references of the servo."""
     for a in range(first, f.actions):
         i = f.driven_axis[a]
         goal = _clip_action(f, action, a) * f.fastest[i]
-        rate = _limit_change(e.reference_rate[i], goal, f.acceleration * f.period)
-        place = e.reference[i] + f.period * rate
-        low = max(f.ranges[i, 0], e.joint[i] - _MAX_REFERENCE_LEAD)
-        high = min(f.ranges[i, 1], e.joint[i] + _MAX_REFERENCE_LEAD)
-        if place < low or place > high:
-            place, rate = min(high, max(low, e.reference[i])), 0.0
-        e.reference[i], e.reference_rate[i] = place, rate
+        e.reference[i], e.reference_rate[i] = advance_joint_reference(
+            e.reference[i], e.reference_rate[i], goal, e.joint[i], f.ranges[i], f.acceleration, f.period
+        )
 
 
 @compiled
 def _integrate_pose_rates(f, e, action):
-    """Integrate tip rate actions over one control period, and convert the tip pose to joint references.
-
-    If the new pose is not reachable, the references are held. If a reference is too far from its
-    measured joint, the references are moved to a limited distance from the measured joints.
-    """
-    k, wanted = f.arm_axes, np.empty(MAX_ARM_AXES)
-    for c in range(MAX_ARM_AXES):
-        goal = 0.0
-        if c < k:
-            goal = _clip_action(f, action, c) * f.fastest_pose[c]
-        e.pose_rate[c] = _limit_change(e.pose_rate[c], goal, f.accelerations[c] * f.period)
-        wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
-    far, ranges = False, np.empty((k, 2))
+    """Integrate tip rate actions over one control period, and convert the tip pose to joint references."""
+    k, goal = f.arm_axes, np.zeros(MAX_ARM_AXES)
+    for c in range(k):
+        goal[c] = _clip_action(f, action, c) * f.fastest_pose[c]
+    ranges = np.empty((k, 2))
     q, rates, joint = arm_values(f, e.reference), arm_values(f, e.reference_rate), arm_values(f, e.joint)
     for a in range(k):
-        far = far or abs(q[a] - joint[a]) > _MAX_REFERENCE_LEAD
         ranges[a, 0], ranges[a, 1] = f.ranges[f.driven_axis[a], 0], f.ranges[f.driven_axis[a], 1]
-    held = far or step_references_to_pose(f.arm, ranges, wanted, e.pose_rate, False, e.pose, q, rates)
-    e.blocked = 1 if held else 0
-    if held:
-        e.pose_rate[:], rates[:] = 0.0, 0.0
-    if far:  # the arm is blocked by an obstacle: continue from its measured position
-        for a in range(k):
-            q[a] = _limit_change(joint[a], q[a], _MAX_REFERENCE_LEAD)
-        compute_tip_pose(f.arm, q, e.pose)
+    arm = ArmLimits(f.arm, ranges, f.accelerations)
+    e.blocked = 1 if advance_pose_reference(arm, goal, f.period, joint, e.pose, e.pose_rate, q, rates) else 0
     for a in range(k):
         e.reference[f.driven_axis[a]], e.reference_rate[f.driven_axis[a]] = q[a], rates[a]
 
@@ -249,6 +218,20 @@ def _run_control_period(f, e, sim):
 
 
 @compiled
+def _add_drive_work(f, e, sim):
+    """Add the positive work of the hydraulic drives in one control period to the episode, by the rectangle rule."""
+    k, none = f.hydraulic, np.empty(f.hydraulic)
+    velocity, rate, arm = np.empty(k), np.empty(k), np.empty(k)
+    table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
+    for i in range(k):
+        rate[i] = sim.qvel[f.dof[i]]
+    interpolate_drive_reference(f.grid[:k], table, e.position[:k], rate, 1.0, velocity, arm, none, none)
+    for i in range(k):
+        force = f.servo[i, 1] * sim.act[4 * i + 2] - f.servo[i, 2] * sim.act[4 * i + 3]
+        e.work += max(0.0, force * velocity[i]) * f.period
+
+
+@compiled
 def _check_stability(f, e, d):
     """Count and clear the warnings of MuJoCo in mjData at the address `d`.
 
@@ -285,6 +268,7 @@ def _begin_episode(f, e, w):
     e.episode += 1
     e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
     e.command[:] = 0.0
+    e.work = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
     sim = _make_simulation_record(f, e, w)
@@ -335,6 +319,7 @@ def _run_environment_step(f, e, w, action):
         _run_control_period(f, e, sim)
         e.tick += 1
         update_sensors(f, e, sim)
+        _add_drive_work(f, e, sim)
         call_task_part(f, w, TICK, 0)  # after the physics: before it, body positions belong to another simulation
     copy_values(e.tip, w.tip)
     e.step += 1

@@ -57,6 +57,7 @@ EPISODE_STATE = np.dtype(
         ("load", _F, MAX_AXES),  # low-pass filtered drive forces [N], [N m]
         ("command", _F, MAX_AXES),  # valve and drive commands [1], or in the drive's unit
         ("drive", _F, (4, MAX_AXES)),  # reference drive velocity, moment arm, two chamber volumes
+        ("work", _F),  # positive work of the hydraulic drives on the mechanism since the start [J]
         ("goal", _F, GOAL_SIZE),  # values of the task
     ],
     align=True,
@@ -75,6 +76,7 @@ TASK_PARAMETERS = np.dtype(
         ("arm_axes", _I),  # number of arm axes, which come first
         ("actions", _I),  # number of actions, one per driven axis or tip coordinate
         ("observations", _I),
+        ("with_readings", _I),  # whether the observation starts with the readings of the machine
         ("horizon", _I),  # steps per episode
         ("ticks", _I),  # control periods per step
         ("substeps", _I),  # physics steps per control period

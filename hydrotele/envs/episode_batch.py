@@ -5,12 +5,15 @@ The `gymnasium` and `dm_env` environments, single and batched, are wrappers arou
 
 import copy
 import dataclasses
+import functools
+import hashlib
 
 import mujoco
 import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.control.servo import tabulate_drive_geometry
+from hydrotele.core.datafile import validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode import (
@@ -24,11 +27,12 @@ from hydrotele.envs.episode import (
     make_seed_states,
 )
 from hydrotele.envs.observation import list_machine_observation_fields
-from hydrotele.envs.task import Options, Task
+from hydrotele.envs.saved_state import SavedState, restore_state, save_state
+from hydrotele.envs.task import Options, Task, load_task_machine
 from hydrotele.envs.task_parameters import make_task_parameters
 from hydrotele.envs.task_setup import TaskSetup, make_timing
 from hydrotele.envs.variants import make_variants
-from hydrotele.machine.machine_file import load_machine
+from hydrotele.scenario.scenario import Servo
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.batch import SimulationBatch
 from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
@@ -70,12 +74,16 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
         duration=task.duration if options.duration is None else options.duration,
     )  # fmt: skip
     check_count("variants", options.variants, 1, MAX_VARIANTS)
-    machine, clock = load_machine(task.machine, task.tool), make_timing(options)
-    arm = arm_axes(machine)
-    axes = (*arm, *task.extra_axes)
+    machine, clock = load_task_machine(task, options), make_timing(options)
+    arm = arm_axes(machine) if machine.arm else ()
     variants = make_variants(task, options, machine)
-    fields = [*list_machine_observation_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
+    axes = (*arm, *task.extra_axes) or variants.plant.axes
+    readings = list_machine_observation_fields(machine, axes, len(arm)) if task.with_readings else []
+    fields = [*readings, *task.fields(machine, axes)]
     table = tabulate_drive_geometry(machine, variants.plant.axes)[1]
+    if options.servo:
+        settings = task.servo.model_dump(exclude_unset=True) | options.servo
+        task = dataclasses.replace(task, servo=validate_data(Servo, settings, "environment option 'servo'", {}))
     return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 
 
@@ -245,6 +253,50 @@ class TaskCore:
         if np.shape(action) != wanted:
             raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
         self.step(action)
+
+    @functools.cached_property
+    def _environment(self) -> str:
+        """Description of task, machine and options, one per line: the same for environments that share states."""
+        setup = self.setup
+        options = dataclasses.asdict(setup.options)
+        del options["machine"]
+        machine = hashlib.sha256(repr(setup.machine).encode()).hexdigest()[:12]
+        lines = [f"task {setup.task.name}", f"machine {setup.machine.name} with tool {setup.machine.tool} ({machine})"]
+        lines += [f"observation {', '.join(field.name for field in setup.fields)}"]
+        return "\n".join([*lines, *(f"{name}={value!r}" for name, value in options.items())])
+
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        """Return the live arrays (n, ...) that make up the state of the episodes."""
+        self.simulations.require_open()
+        named = {
+            "physics": self.simulations.state, "episodes": self.episodes, "observation": self.observation,
+            "final_observation": self.final_observation, "reward": self.reward, "terminated": self.terminated,
+            "truncated": self.truncated, "measures": self.measures, "final_measures": self.final_measures,
+            "terrain": self.terrain, "commands": self._commands, "sensed": self._sensed,
+            "sensed_before": self._sensed_before, "is_started": self._is_started,
+        }  # fmt: skip
+        return named | {f"model.{name}": live for name, live in self._expanded_fields.items()}
+
+    def get_state(self, index: np.ndarray | int | None = None) -> SavedState:
+        """Return a copy of the complete state of the episodes.
+
+        Args:
+            index: indices of the episodes, None for all.
+        """
+        return save_state(self._environment, self._state_arrays(), index)
+
+    def set_state(self, state: SavedState, index: np.ndarray | int | None = None) -> None:
+        """Continue from a saved state: the next steps give the same bits as they did after `get_state`.
+
+        Args:
+            state: result of `get_state` of an environment with the same task, machine and options, single or
+                batched; a state of one episode is written to all.
+            index: indices of the episodes to set, None for all.
+
+        Raises:
+            InputError: the state belongs to another environment, or has another number of episodes.
+        """
+        restore_state(self._environment, self._state_arrays(), state, index)
 
     def copy_model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return copies of the MuJoCo model and data of the simulation `number`, after `mj_forward`."""

@@ -37,6 +37,7 @@ from hydrotele.envs.task_interface import (
 )
 from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.machine.machine import Machine
+from hydrotele.simulate.soil_bed import machine_bucket
 from hydrotele.soil.parameters import (
     FORCE_R,
     FORCE_Z,
@@ -286,13 +287,14 @@ def _make_soil_bed_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[
 
     Unused values between them are 0.
     """
-    bed = pack_soil_bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
+    bed = pack_soil_bed_parameters([SOILS[name] for name in GRADE_SOILS], machine_bucket(machine)).tolist()
     return (*bed, *[0.0] * (MAX_PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
 
 GRADE = Task(
     name="Grade",
     kind="grade",
+    needs=("swing", "boom", "stick", "tool"),
     description=(
         "An excavator cuts a low bank of soft, loamy or firm soil down to a plane of given height"
         " and slope and carries the soil away. The plane lies 3.8 to 5.8 m in front of it. The swing"

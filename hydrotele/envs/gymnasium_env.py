@@ -19,6 +19,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
 from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.rendering import Camera, TaskRenderer
+from hydrotele.envs.saved_state import SavedState
 from hydrotele.envs.task_catalogue import make_task_core
 from hydrotele.show.live_window import check_screen
 from hydrotele.show.offscreen_renderer import add_markers_to_scene
@@ -154,13 +155,13 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
 
     def __init__(
-        self, task: str, render_mode: str | None = None, width: int = 640, height: int = 480,
+        self, task: Any, render_mode: str | None = None, width: int = 640, height: int = 480,
         camera: Camera = None, **options: Any,
     ) -> None:  # fmt: skip
         """Create the environment: compile the machine variants and define observation and action space.
 
         Args:
-            task: name of the task, as in `hydrotele/<Name>-v0`.
+            task: name of the task, as in `hydrotele/<Name>-v0`, or a class or object of `PythonTask`.
             render_mode: None, `rgb_array` for images, or `human` for a window.
             width: width of images [pixel].
             height: height of images [pixel].
@@ -228,6 +229,27 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             bool(core.truncated[0]), self._make_info(),
         )  # fmt: skip
 
+    def get_state(self) -> SavedState:
+        """Return a copy of the complete state, for `set_state` of this or an equal environment."""
+        return self.core.get_state()
+
+    def set_state(self, state: SavedState) -> np.ndarray:
+        """Continue from a saved state; the next steps give the same bits as they did after `get_state`.
+
+        Args:
+            state: of one episode of an environment with the same task, machine and options, single or batched.
+
+        Returns:
+            (o,) the observation in this state.
+
+        Raises:
+            InputError: the state belongs to another environment, or has several episodes.
+        """
+        self.core.set_state(state)
+        self._is_started = True
+        self._show_step()
+        return self.core.observation[0].copy()
+
     def _make_info(self) -> dict[str, Any]:
         return {name: values[0] for name, values in make_info(self.core).items()}
 
@@ -287,14 +309,14 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
-        self, task: str, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
+        self, task: Any, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, width: int = 640,
         height: int = 480, camera: Camera = None, render_count: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Create the environments: compile the machine variants and define observation and action spaces.
 
         Args:
-            task: name of the task.
+            task: name of the task, or a class or object of `PythonTask`.
             num_envs: number of environments n.
             render_mode: None or `rgb_array`.
             threads: number of threads that step the environments; 0 for one per core. Results do
@@ -396,6 +418,28 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             core.observation.copy(), core.reward.copy(), core.terminated.astype(bool),
             core.truncated.astype(bool), infos,
         )  # fmt: skip
+
+    def get_state(self, index: Any = None) -> SavedState:
+        """Return a copy of the complete state of the environments `index` (None: all)."""
+        return self.core.get_state(index)
+
+    def set_state(self, state: SavedState, index: Any = None) -> np.ndarray:
+        """Continue from a saved state; the next steps give the same bits as they did after `get_state`.
+
+        Args:
+            state: state of as many episodes as are set, or of one that is written to all of them: an environment,
+                single or batched, with the same task, machine and options has returned it.
+            index: indices of the environments to set, None for all.
+
+        Returns:
+            (n, o) the observations of all environments.
+
+        Raises:
+            InputError: the state belongs to another environment, or has another number of episodes.
+        """
+        self.core.set_state(state, index)
+        self._is_started = True
+        return self.core.observation.copy()
 
     def _make_infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
         there = np.zeros(self.num_envs, bool)

@@ -250,6 +250,7 @@ def _make_plate_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[flo
 HOLD_FORCE = Task(
     name="HoldForce",
     kind="force",
+    needs=("swing", "boom", "stick", "tool"),
     description=(
         "The bucket of an excavator presses on a plate that stands on a spring of unknown"
         " stiffness. The reference force is between 10 and 35 kN and changes once."

@@ -90,7 +90,7 @@ def list_machine_observation_fields(machine: Machine, axes: tuple[str, ...], arm
 
     Returns:
         The fields, in order: positions, rates, head and rod pressures of the driven axes,
-        supply pressures, pose of the tip, commands.
+        supply pressures, pose of the tip (for a machine with an arm), commands.
     """
     valves = [name for name in axes if machine.axes[name].is_hydraulic]
     fields = [make_position_observation_field(machine, name) for name in axes]
@@ -99,7 +99,8 @@ def list_machine_observation_fields(machine: Machine, axes: tuple[str, ...], arm
     fields += [ObservationField(f"pressure_rod.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     if valves:
         fields += [ObservationField(channel, "Pa", *_PRESSURE_BOUNDS) for channel in machine.supply_channels]
-    fields += make_pose_observation_fields(machine, arm_axes)
+    if arm_axes:
+        fields += make_pose_observation_fields(machine, arm_axes)
     for name in axes:
         force = machine.axes[name].force
         limit = force.command_limit if force else 1.0
@@ -118,11 +119,13 @@ def write_machine_observation(f, e, out):
         out: (observations,) float32, written from index 0 on.
 
     Returns:
-        Number of values written, scalar.
+        Number of values written, scalar; 0 for a task whose observation has no readings.
 
     Source: `list_machine_observation_fields`.
     """
     at = 0
+    if f.with_readings == 0:
+        return at
     for a in range(f.axes_driven):
         out[at] = e.joint[f.driven_axis[a]]
         at += 1
@@ -141,11 +144,12 @@ def write_machine_observation(f, e, out):
         for i in range(f.supplies):
             out[at] = e.supply[i]
             at += 1
-    pose = np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
-    for c in range(max(4, f.arm_axes)):
-        out[at] = pose[c]
-        at += 1
+    if f.arm_axes > 0:
+        pose = np.empty(MAX_ARM_AXES)
+        compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
+        for c in range(max(4, f.arm_axes)):
+            out[at] = pose[c]
+            at += 1
     for a in range(f.axes_driven):
         out[at] = e.command[f.driven_axis[a]]
         at += 1

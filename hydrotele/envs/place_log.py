@@ -458,6 +458,7 @@ def _make_grapple_parameters(machine: Machine, model: mujoco.MjModel) -> np.ndar
 PLACE_LOG = Task(
     name="PlaceLog",
     kind="place",
+    needs=("swing", "boom", "stick", *FREE_JOINTS),
     description=(
         "An excavator picks up a log from the ground with a freely swinging grapple and lays it"
         " down at a goal position and yaw. The poses of log and goal are known exactly, also with"

@@ -207,6 +207,7 @@ def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[
 REACH_FELLER = Task(
     name="ReachFeller",
     kind="reach",
+    needs=("swing", "boom", "stick", "tool", "head"),
     description="A feller-buncher moves its head to a pose with all five axes and holds it there.",
     reward=(
         "The reward is 1 for every metre that the head approaches the pose (1 rad of attitude or"

@@ -6,6 +6,7 @@ in the difference of two positions that vary by metres. It stacks the last steps
 of a machine show only over time. The agent may correct the action of a reference controller.
 """
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -158,13 +159,13 @@ class StableVecEnv(_VecEnvBase):
     """
 
     def __init__(
-        self, task: str, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
+        self, task: Any, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
         **options: Any,
     ) -> None:  # fmt: skip
         """Create the environments: compile the machine variants and define the spaces.
 
         Args:
-            task: name of the task.
+            task: name of the task, or a class or object of `PythonTask`.
             num_envs: number of environments n.
             threads: number of threads that step the environments; 0 for one per core.
             view: transform between environment and agent, made from the same task and options.
@@ -258,6 +259,23 @@ class StableVecEnv(_VecEnvBase):
                 "episode": {"r": total, "l": length, "t": 0.0},
             }  # fmt: skip
         self._return[ended], self._length[ended] = 0.0, 0
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of the complete state with the history of the agent and the state of its controller."""
+        return {
+            "core": self.core.get_state(), "view": copy.deepcopy(self.view), "return": self._return.copy(),
+            "length": self._length.copy(),
+        }  # fmt: skip
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Continue from a state of `get_state`; the next steps give the same bits as they did after it.
+
+        Raises:
+            InputError: the state belongs to another environment, or has another number of episodes.
+        """
+        self.core.set_state(state["core"])
+        self.view = copy.deepcopy(state["view"])
+        self._return[:], self._length[:] = state["return"], state["length"]
 
     def close(self) -> None:
         """Free the memory of the simulations."""

@@ -12,7 +12,14 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_pose_observation_fields, max_reach
-from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
+from hydrotele.envs.task import (
+    Task,
+    compute_measured_pose,
+    compute_path_effort,
+    sample_start_positions,
+    size_ratio,
+    wrap_angle,
+)
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
@@ -55,6 +62,7 @@ _MAX_DRAWS, _FULL_SIZE_DRAWS = (
 _SHRINK_FACTOR = 0.7  # factor of length and speed per draw after those
 # indices in `goal`: pose at the start (r, theta, z, attitude), change of the pose per metre
 _START, _PER_METRE, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
+_SIZE_RATIO = 0  # index in the task parameters
 _R, _THETA, _Z, _ATTITUDE, _HEAD = range(MAX_ARM_AXES)
 # indices in the observation of the task: pose, its rate, positions ahead, errors
 _POSE_COLUMN, _RATE_COLUMN, _PREVIEW_COLUMN = 0, 4, 7
@@ -89,7 +97,7 @@ def draw_line_goal(f, e):
     Direction and length are drawn again until the end has an allowed radius and height, and the
     path lies in the workspace and does not exceed the rates of the drives (`compute_path_effort`).
     After 200 draws, length and speed are reduced with every draw. The last of 240 draws is kept in
-    any case.
+    any case. Lengths, heights and speeds are those of the CAT 215 times the ratio of the reaches.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -101,14 +109,15 @@ def draw_line_goal(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
+    ratio = f.parameters[_SIZE_RATIO]
     compute_tip_pose(f.arm, arm_values(f, e.position), start)
     for c in range(4):
         g[_START + c] = start[c]
     speed, g[_ACCELERATION] = (
-        draw_uniform_between(e, _MIN_SPEED, _MAX_SPEED),
+        ratio * draw_uniform_between(e, _MIN_SPEED, _MAX_SPEED),
         draw_uniform_between(e, _MIN_ACCELERATION, _MAX_ACCELERATION),
     )
-    turn = draw_uniform_between(e, -_MAX_SWING_PER_METRE, _MAX_SWING_PER_METRE)
+    turn = draw_uniform_between(e, -_MAX_SWING_PER_METRE, _MAX_SWING_PER_METRE) / ratio
     if draw_uniform(e) >= _SWING_FRACTION:
         turn = 0.0
     size = 1.0
@@ -117,7 +126,7 @@ def draw_line_goal(f, e):
             size *= _SHRINK_FACTOR  # the start is inside the workspace, so a short slow line fits
         way, length = (
             draw_uniform_between(e, -math.pi, math.pi),
-            size * draw_uniform_between(e, _MIN_LENGTH, _MAX_LENGTH),
+            size * ratio * draw_uniform_between(e, _MIN_LENGTH, _MAX_LENGTH),
         )
         g[_PER_METRE + _R], g[_PER_METRE + _THETA] = math.cos(way), turn
         g[_PER_METRE + _Z] = math.sin(way)
@@ -125,7 +134,7 @@ def draw_line_goal(f, e):
         for c in range(3):
             change[c] = length * g[_PER_METRE + c]
         end = start + change
-        if end[_R] < _MIN_RADIUS or not _MIN_HEIGHT <= end[_Z] <= _MAX_HEIGHT:
+        if end[_R] < ratio * _MIN_RADIUS or not _MIN_HEIGHT <= end[_Z] <= ratio * _MAX_HEIGHT:
             continue
         if compute_path_effort(f, start, change) * g[_SPEED] / length <= _MAX_EFFORT:
             break
@@ -288,14 +297,17 @@ def compute_line_reward(f, e, w):
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Return random start positions, arm axis -> [rad], with the bucket in the air.
 
-    The range is about that of Zhu 1994, Figs 6.45-6.48.
+    The range is about that of Zhu 1994, Figs 6.45-6.48, for a machine of the reach of the CAT 215.
     """
-    return sample_start_positions(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
+    ratio = size_ratio(machine, "cat215", "bucket")
+    low, high = (4.8 * ratio, -0.5, 0.4 * ratio, -1.9), (6.5 * ratio, 0.5, 2.4 * ratio, -1.2)
+    return sample_start_positions(machine, rng, low, high)
 
 
 STRAIGHT_LINE = Task(
     name="StraightLine",
     kind="line",
+    needs=("swing", "boom", "stick", "tool"),
     description=(
         "The tip of an excavator's bucket moves along a straight line of 1 to 3 m at 0.2 to 0.6 m/s"
         " with constant attitude."
@@ -310,6 +322,7 @@ STRAIGHT_LINE = Task(
     duration=16.5,  # s: enough for the longest and slowest line
     start=_sample_start_positions,
     fields=list_line_observation_fields,
+    parameters=lambda machine, model: (size_ratio(machine, "cat215", "bucket"),),
     measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
     # a higher gain excites the oil resonance of the boom near the end of its range
     servo=Servo(axis_gains={"boom": 2.0}),

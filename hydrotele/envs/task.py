@@ -6,6 +6,7 @@ whether it stays in the workspace.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +15,13 @@ import mujoco
 import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_specification
-from hydrotele.core.compiled import compiled
+from hydrotele.core.compiled import Callback, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES, arm_values
-from hydrotele.envs.observation import ObservationField
+from hydrotele.envs.observation import ObservationField, max_reach
 from hydrotele.kinematics.task_space import REACHED, compute_joint_rates, compute_tip_pose, solve_joint_angles
-from hydrotele.machine.machine import Machine
+from hydrotele.machine.machine import Arm, Machine
+from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo
 from hydrotele.scenario.surrounding_objects import SurroundingObject
 
@@ -33,12 +35,15 @@ class Task:
 
     Attributes:
         name: as in `hydrotele/<Name>-v0`.
-        kind: name of its native code in `envs.task_parameters.TASK_CODES`.
+        kind: name of its native code in `envs.task_parameters.TASK_CODES`; not used with `code`.
         description: description of the task.
         reward: description of the reward and the termination.
-        machine: name of the machine.
+        machine: name of the machine, if the user names none.
         tool: name of the tool, None for the first tool of the machine.
-        extra_axes: driven axes in addition to those of the arm.
+        needs: what another machine must have: joints of its arm (`swing`, `boom`, `stick`, `tool`, `head`), or
+            names of joints.
+        extra_axes: driven axes in addition to those of the arm; without an arm, those of a task without
+            `extra_axes` are all axes of the machine.
         action: default kind of actions.
         duration: duration of an episode [s].
         start: function (machine, random generator) -> {axis or joint name: position at the start}.
@@ -54,6 +59,9 @@ class Task:
         pose_rates: tip rates at full action: r [m/s], theta [rad/s], z [m/s], attitude, head
             [rad/s].
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
+        with_readings: whether the observation starts with the readings of the machine.
+        code: native code of a task outside this package, None for an entry of TASK_CODES.
+        program: the task in plain Python that `code` does not compute, see `envs.python_task`; None without one.
     """
 
     name: str
@@ -65,6 +73,7 @@ class Task:
     start: Callable[[Machine, np.random.Generator], dict[str, float]]
     fields: Callable[[Machine, tuple[str, ...]], list[ObservationField]]
     measures: tuple[tuple[str, str], ...]
+    needs: tuple[str, ...] = ("swing", "boom", "stick")
     extra_axes: tuple[str, ...] = ()
     action: ActionKind = "valve"
     duration: float = 20.0
@@ -78,6 +87,9 @@ class Task:
     written_fields: tuple[str, ...] = ()
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
     servo: Servo = Servo()
+    with_readings: bool = True
+    code: Callback | None = None
+    program: Any = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +97,9 @@ class Options:
     """Options of an environment; None selects the default of the task.
 
     Attributes:
+        machine: name of a shipped machine, a machine folder or file, or a `Machine` with a tool.
+        tool: tool of the machine. The default for another machine is the tool of the task if the machine has it,
+            or else the first tool of the machine.
         action: `valve` (valve commands), `joint_rate` (axis rates, tracked by the joint servo) or
             `resolved_motion` (tip rates, converted to axis rates).
         sensors: `ideal`, `real` (the first set of sensors of the machine) or the name of a set.
@@ -97,8 +112,12 @@ class Options:
         variants: number of random machines and starts; every episode uses one of them.
         variant_seed: seed for drawing the variants.
         timestep: physics step [s].
+        servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
+            `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
     """
 
+    machine: str | Path | Machine | None = None
+    tool: str | None = None
     action: ActionKind | None = None
     sensors: str = "ideal"
     control_rate: float = 50.0
@@ -108,6 +127,7 @@ class Options:
     variants: int = 64
     variant_seed: int = 0
     timestep: float = 1.0e-3
+    servo: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
@@ -146,7 +166,59 @@ def sample_start_positions(
             and ((ranges[:, 0] + _START_MARGIN <= joints) & (joints <= ranges[:, 1] - _START_MARGIN)).all()
         ):
             return dict(zip(axes, joints.tolist(), strict=True))
-    raise InputError(f"start of {machine.name}", f"no pose from {low} to {high} can be reached")
+    message = (
+        f"no pose from {low} to {high} (r, theta, z, attitude, head) can be reached; choose another machine or tool"
+    )
+    raise InputError(f"start of {machine.name} with tool {machine.tool}", message)
+
+
+def size_ratio(machine: Machine, name: str, tool: str) -> float:
+    """Return the maximum reach of a machine divided by that of a shipped machine `name` with a tool [1]."""
+    return max_reach(machine) / _shipped_reach(name, tool)
+
+
+@functools.cache
+def _shipped_reach(name: str, tool: str) -> float:
+    return max_reach(load_machine(name, tool))
+
+
+def load_task_machine(task: Task, options: Options) -> Machine:
+    """Load the machine of a task, or the one that the user chose, with its tool.
+
+    Raises:
+        InputError: the machine or tool does not exist, or the machine has no such arm or axes as the task requires.
+    """
+    chosen = options.machine
+    if isinstance(chosen, Machine):
+        if options.tool not in (None, chosen.tool):
+            raise InputError(
+                f"tool {options.tool!r}", f"the machine is loaded with the tool {chosen.tool!r}; leave out tool"
+            )
+        machine = chosen
+    elif chosen is None:
+        machine = load_machine(task.machine, options.tool or task.tool)
+    else:
+        machine = load_machine(chosen, options.tool)
+        if options.tool is None and task.tool in machine.tools:
+            machine = load_machine(chosen, task.tool)
+    check_task_machine(task, machine)
+    return machine
+
+
+def check_task_machine(task: Task, machine: Machine) -> None:
+    """Raise InputError unless a machine has all joints and axes of `Task.needs` and `Task.extra_axes`."""
+    names = machine.joints.keys() | machine.axes.keys()
+    missing = [name for name in task.needs if not getattr(machine.arm, name, None) and name not in names]
+    missing += [name for name in task.extra_axes if name not in machine.axes]
+    if machine.arm is None:
+        missing = [name for name in task.needs if name in Arm.model_fields] or missing
+    if not missing:
+        return
+    needed = ", ".join(dict.fromkeys((*task.needs, *task.extra_axes)))
+    tools = f"; it has the tools {', '.join(machine.tools)}" if len(machine.tools) > 1 else ""
+    arm = " (its machine file has no `arm`)" if machine.arm is None else ""
+    lacking = f"{machine.name} with the tool {machine.tool} lacks {', '.join(missing)}"
+    raise InputError(f"task {task.name}", f"needs a machine with {needed}; {lacking}{arm}{tools}")
 
 
 _PATH_SEGMENTS = 16  # number of path segments whose ends are checked

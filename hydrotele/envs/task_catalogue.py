@@ -8,14 +8,17 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.core.plugins import find_plugins, is_object_reference, load_object
+from hydrotele.envs import PLUGIN_GROUP
 from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.grade import GRADE
 from hydrotele.envs.hold_force import HOLD_FORCE
 from hydrotele.envs.place_log import PLACE_LOG
+from hydrotele.envs.python_task import PythonTaskCore, find_python_task
 from hydrotele.envs.reach_feller import REACH_FELLER
 from hydrotele.envs.straight_line import STRAIGHT_LINE
-from hydrotele.envs.task import Options
+from hydrotele.envs.task import Options, Task
 from hydrotele.envs.track_trajectory import TRACK_TRAJECTORY
 
 TASKS = {
@@ -31,18 +34,48 @@ TASKS = {
 }
 """Tasks by name."""
 
-_STRICT_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
+_STRICT_CONFIG = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 _OPTION_TYPES: dict[str, TypeAdapter] = {
     name: TypeAdapter(hint, config=_STRICT_CONFIG) for name, hint in get_type_hints(Options).items()
 }
 _COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import precompile_loop_residuals as compile_; compile_()"
 
 
-def make_task_core(task: str, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
+def find_task(task: str | Task | type | Any) -> Task:
+    """Return a task by the name of a shipped task or of a plug-in, or from an object.
+
+    Args:
+        task: name; `module:class` or `FILE.py:class`; a `Task`; or a subclass or object of `PythonTask`.
+
+    Raises:
+        InputError: there is no such task, or the plug-in cannot be loaded or is not a task.
+    """
+    if isinstance(task, Task):
+        return task
+    if task is None:
+        raise InputError("hydrotele/Custom-v0", "needs a task: gymnasium.make('hydrotele/Custom-v0', task=MyTask)")
+    if not isinstance(task, str):
+        return find_python_task(task)
+    if task in TASKS:
+        return TASKS[task]
+    if is_object_reference(task):
+        found = load_object(task)
+        return found if isinstance(found, Task) else find_python_task(found)
+    plugins = find_plugins(PLUGIN_GROUP)
+    if task not in plugins:
+        raise InputError(f"task {task!r}", suggest_valid_name(task, [*TASKS, *plugins]))
+    content = plugins[task].load()
+    try:
+        return content if isinstance(content, Task) else find_python_task(content)
+    except InputError as error:
+        raise InputError(plugins[task].source, str(error)) from None
+
+
+def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
     """Make a running task from its name and options.
 
     Args:
-        task: name of the task.
+        task: name of the task, or another argument of `find_task`.
         choices: fields of `envs.task.Options`.
         count: number of environments.
         threads: number of threads that step the environments, 0 for one per core.
@@ -54,8 +87,7 @@ def make_task_core(task: str, choices: dict[str, Any], count: int, threads: int,
     Raises:
         InputError: the task or an option does not exist, or a value is not valid.
     """
-    if task not in TASKS:
-        raise InputError(f"task {task!r}", suggest_valid_name(task, TASKS))
+    found = find_task(task)
     known = {field.name for field in dataclasses.fields(Options)}
     if strange := set(choices) - known:
         name = sorted(strange)[0]
@@ -64,7 +96,8 @@ def make_task_core(task: str, choices: dict[str, Any], count: int, threads: int,
     step_or_reset_simulation.compile_in_background(
         _COMPILE_LOOPS_COMMAND
     )  # while the plant's own code is compiled here
-    return TaskCore(TASKS[task], options, count, threads, autoreset)
+    make = PythonTaskCore if found.program is not None else TaskCore
+    return make(found, options, count, threads, autoreset)
 
 
 def _validate_options(choices: dict[str, Any]) -> Options:

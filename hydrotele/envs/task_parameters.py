@@ -48,7 +48,13 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     task, options, plant = setup.task, setup.options, setup.variants.plant
     if options.action not in ACTIONS:
         raise InputError(f"action {options.action!r}", suggest_valid_name(options.action, ACTIONS))
-    facts["task"], facts["mode"] = TASK_CODES[task.kind].address, ACTIONS.index(options.action)
+    if options.action != "valve" and (pumped := [name for name in setup.axes if setup.machine.axes[name].pump]):
+        message = f"the servo does not control {pumped[0]}, which has its own pump; choose valve"
+        raise InputError(f"action {options.action!r}", message)
+    if options.action == "resolved_motion" and not setup.arm_axes:
+        raise InputError("action 'resolved_motion'", f"{setup.machine.name} has no arm; choose valve or joint_rate")
+    code = task.code or TASK_CODES[task.kind]
+    facts["task"], facts["mode"] = code.address, ACTIONS.index(options.action)
     facts["autoreset"], facts["count"] = autoreset, count
     clock = setup.clock
     facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]
@@ -57,13 +63,15 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     facts["supplies"] = len(plant.machine.supply_channels)
     facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)
     facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
+    facts["with_readings"] = task.with_readings
     columns = [plant.axes.index(name) for name in setup.axes]
     facts["driven_axis"][: len(columns)] = columns
     k, model = len(plant.axes), plant.model
     facts["qpos"][:k], facts["dof"][:k] = plant.qpos, plant.dof
     facts["nq"], facts["nv"], facts["na"] = model.nq, model.nv, model.na
-    facts["nbody"], facts["tip_site"] = model.nbody, model.site(TIP_SITE).id
-    facts["tip_body"] = model.site(TIP_SITE).bodyid[0]
+    facts["nbody"], facts["tip_site"] = model.nbody, -1
+    if setup.arm_axes:
+        facts["tip_site"], facts["tip_body"] = model.site(TIP_SITE).id, model.site(TIP_SITE).bodyid[0]
     theta = 1 if options.action == "resolved_motion" else 0  # index of the swing action
     facts["locked"] = theta if task.swing_locked else -1
     facts["neq"], facts["eq_width"] = model.eq_data.shape
@@ -88,7 +96,8 @@ def _write_machine_parameters(facts: np.ndarray, setup: TaskSetup, columns: list
     facts["closed"][columns] = int(facts["mode"]) != VALVE
     ranges = [machine.joints[machine.axes[name].joint].range for name in plant.axes]
     facts["ranges"][:k] = [limits or (-np.inf, np.inf) for limits in ranges]
-    facts["arm"] = arm_specification(machine)[0]
+    if setup.arm_axes:
+        facts["arm"] = arm_specification(machine)[0]
     facts["servo"][:k] = servo_parameters(machine, plant.axes, servo, setup.clock.period)
     facts["feedforward"] = servo.feedforward
     facts["grid"][:k] = tabulate_drive_geometry(machine, plant.axes)[0]

@@ -29,7 +29,7 @@ from hydrotele.simulate.record import sensed_channels, start_leapfrog
 from hydrotele.simulate.stepping import command_delays, sensor_delays
 
 _MAX_CACHED_SETS = 8  # maximum number of cached sets of variants, which the environments of a process share
-_CACHE: dict[str, "Variants"] = {}
+_CACHE: dict[str, tuple["Variants", Task]] = {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,13 +82,14 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     """
     ranges, folder = split_randomise(options)
     written = folder and [file.stat().st_mtime_ns for file in sorted(folder.glob("posterior*")) if file.is_file()]
-    key = repr((task.name, options.effects, ranges, folder and resolve_path(folder), written, options.variants,
-                options.variant_seed, options.timestep))  # fmt: skip
+    key = repr((task.name, id(task), nominal, options.effects, ranges, folder and resolve_path(folder), written,
+                options.variants, options.variant_seed, options.timestep))  # fmt: skip
     if key not in _CACHE:
-        _CACHE[key] = _build_variants(task, options, nominal, ranges, _choose_machine(options, folder, nominal))
+        made = _build_variants(task, options, nominal, ranges, _choose_machine(options, folder, nominal))
+        _CACHE[key] = made, task  # the task is kept, so that no other one gets its id
         while len(_CACHE) > _MAX_CACHED_SETS:
             _CACHE.pop(next(iter(_CACHE)))
-    return _CACHE[key]
+    return _CACHE[key][0]
 
 
 def split_randomise(options: Options) -> tuple[tuple[Mapping[str, Any], ...], Path | None]:
@@ -145,7 +146,7 @@ def _build_variants(
         state = np.zeros(mujoco.mj_stateSize(plant.model, STATE_KIND))
         mujoco.mj_getState(plant.model, data, state, STATE_KIND)
         states.append(state)
-        tips.append(data.site(TIP_SITE).xpos.copy())
+        tips.append(data.site(TIP_SITE).xpos.copy() if nominal.arm else np.zeros(3))
     return Variants(
         plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
         np.array(states), np.array(tips), _find_differing_fields(plants, task.written_fields),

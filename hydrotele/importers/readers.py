@@ -22,6 +22,7 @@ from hydrotele.importers.message_layout import (
     match_path,
     normalise_path,
 )
+from hydrotele.importers.plugin_importers import find_importer, list_plugin_suffixes, read_with_plugin
 from hydrotele.importers.recordings import Group, Recording, convert_time, is_time_name
 from hydrotele.logs.table import read_csv, read_table
 from hydrotele.machine.log_columns import LogColumn
@@ -39,7 +40,7 @@ def read_recording(path: Path, columns: Collection[str] | None, times: Mapping[s
     """Read columns of a recording.
 
     Args:
-        path: bag, MATLAB file, CSV or Parquet file.
+        path: bag, MATLAB file, CSV or Parquet file, or a file that a plug-in reads.
         columns: columns to read, such as `/joint_states.position[boom_joint]`; unknown ones are
             ignored. None reads a part of all columns, to propose a mapping.
         times: columns of a table or of a MATLAB file that are the time, with their conversion;
@@ -56,7 +57,10 @@ def read_recording(path: Path, columns: Collection[str] | None, times: Mapping[s
         return read_matlab(path, columns, times)
     if path.suffix.lower() in TABLE_SUFFIXES:
         return _read_table(path, columns, times)
-    known = f".bag, .db3, .mcap, .mat, {', '.join(TABLE_SUFFIXES)}, or the folder of a ROS 2 bag"
+    if found := find_importer(path):
+        return read_with_plugin(*found, path, columns)
+    suffixes = ", ".join([*TABLE_SUFFIXES, *list_plugin_suffixes()])
+    known = f".bag, .db3, .mcap, .mat, {suffixes}, or the folder of a ROS 2 bag"
     raise InputError(path, f"is not a log that can be imported; these are {known}")
 
 

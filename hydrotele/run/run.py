@@ -30,10 +30,12 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, get_sensor_set
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.oil_temperature import with_oil_temperature
+from hydrotele.run.policy import check_policy_is_allowed, complete_policy_pilot, load_policy
 from hydrotele.run.session import PreparedRun, Session
 from hydrotele.run.tick_loop import (
     start_background_compilation,
 )
+from hydrotele.scenario.pilots import PolicyPilot
 from hydrotele.scenario.scenario import Scenario, find_local_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.conservation_checks import compute_balance_errors
@@ -113,14 +115,16 @@ def _find_impossible_states(plant: Plant, record: Record) -> list[str]:
 def _tracking_errors(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
     """Return RMS and largest absolute value of the tracking errors of a run: name -> `rms`, `max`, `unit`.
 
-    The errors are true minus reference position of every closed-loop axis, at the log rows. If the
+    The errors are true minus reference position of every closed-loop axis, or of every axis for which a
+    policy has a reference, at the log rows. If the
     plan gives a pose of the arm's tip, those of radius, height and attitude are included.
     """
     rows = np.searchsorted(plan.time, record.time - 1e-9)
     result: dict[str, Any] = {}
     for i, name in enumerate(plan.axes):
-        if plan.closed_loop[i]:
-            error = record.qpos[:, plant.qpos[i]] - plan.reference[rows, i]
+        if plan.closed_loop[i] or plan.goal is not None:
+            reference = plan.reference if plan.goal is None else plan.goal
+            error = record.qpos[:, plant.qpos[i]] - reference[rows, i]
             result[name] = _error_statistics(error, "rad" if plant.machine.position_kind(name) == "angle" else "m")
     if plan.pose is not None and record.tip.shape[1]:
         desired = plan.pose[rows]
@@ -238,12 +242,18 @@ def prepare_run(scenario: Scenario) -> PreparedRun:
     plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
     data, start = _initial_data(plant, scenario)
     times = np.arange(scenario.tick_count) / scenario.control_rate
-    plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
+    policy, pilot = None, scenario.pilot
+    if isinstance(pilot, PolicyPilot):
+        check_policy_is_allowed(pilot.policy, scenario.folder)
+        program = load_policy(pilot.policy, scenario.folder)
+        pilot = complete_policy_pilot(pilot, program, machine, plant.axes)
+        policy = program, pilot
+    plan = make_plan(machine, plant.axes, pilot, start, times)
     seen = create_feedback(plant, sensors, scenario.seed, scenario.tick_count, scenario.control_rate)
     if sensors and round(scenario.control_rate / scenario.log_rate) % seen.ticks_per_sample:
         message = f"the sample rate {sensors.rate:g} Hz must be a multiple of log_rate {scenario.log_rate:g} Hz"
         raise InputError(f"sensors {scenario.sensors}", message)
-    return PreparedRun(plant, data, plan, seen, nominal)
+    return PreparedRun(plant, data, plan, seen, nominal, policy)
 
 
 def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:

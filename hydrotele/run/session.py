@@ -21,12 +21,15 @@ from hydrotele.control.plan import Plan
 from hydrotele.control.servo import compute_drive_references, servo_parameters
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
+from hydrotele.run.policy import Policy
+from hydrotele.run.policy_driver import PolicyDriver, PolicyLoop
 from hydrotele.run.tick_loop import (
     make_tick_loop,
     run_planned_ticks,
     run_teleoperated_ticks,
     update_max_pin_opening,
 )
+from hydrotele.scenario.pilots import PolicyPilot
 from hydrotele.scenario.scenario import Scenario, find_local_force_model
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.conservation_checks import full_physics_state
@@ -49,6 +52,7 @@ class PreparedRun(NamedTuple):
         plan: references and commands of the axes over time.
         sensor_feedback: simulated sensor readings that the controller uses.
         nominal_machine: the machine as its controller knows it, without the scenario's effects.
+        policy: program that computes the actions, and its specification with all values; None without one.
     """
 
     plant: Plant
@@ -56,6 +60,7 @@ class PreparedRun(NamedTuple):
     plan: Plan
     sensor_feedback: Feedback
     nominal_machine: Machine
+    policy: tuple[Policy, PolicyPilot] | None = None
 
 
 class SessionResult(NamedTuple):
@@ -110,7 +115,7 @@ class Session:
         Raises:
             InputError: servo, force model or station do not fit the machine.
         """
-        plant, data, plan, seen, nominal = prepared
+        plant, data, plan, seen, nominal, policy = prepared
         plan = dataclasses.replace(
             plan, reference=np.ascontiguousarray(plan.reference, float),
             rate=np.ascontiguousarray(plan.rate, float),
@@ -149,6 +154,10 @@ class Session:
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
             self.station = TeleoperationSystem(plant, data, scenario, plan, drives, seen, hand)
+        self._policy = None
+        if policy:
+            loop = PolicyLoop(plan, drives, seen, self._commands, self.initial_commands, 1.0 / self._dt)
+            self._policy = PolicyDriver(*policy, nominal, scenario.servo, loop)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
         self._ticks = make_tick_loop(
             plant.model, data, self._stepper.steps, self.ticks_per_row, scenario.row_count, self._dt
@@ -194,6 +203,8 @@ class Session:
             end = min(end, first + self.ticks_per_row - left)
             if not left and row < len(self._recorder.late):
                 self._recorder.record_sensor_values(row, stepper.sensor_values())
+        if self._policy:
+            end = min(end, self._policy.prepare_tick(first))
         if station is None:
             self.tick = run_planned_ticks(*self._records, first, end, False)
         else:
@@ -270,7 +281,8 @@ class Session:
 
 def _cut_plan(plan: Plan, ticks: int) -> Plan:
     pose = None if plan.pose is None else plan.pose[:ticks]
+    goal, rate = (None if array is None else array[:ticks] for array in (plan.goal, plan.goal_rate))
     return dataclasses.replace(
         plan, time=plan.time[:ticks], command=plan.command[:ticks],
-        reference=plan.reference[:ticks], rate=plan.rate[:ticks], pose=pose,
+        reference=plan.reference[:ticks], rate=plan.rate[:ticks], pose=pose, goal=goal, goal_rate=rate,
     )  # fmt: skip

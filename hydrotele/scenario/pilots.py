@@ -189,7 +189,41 @@ class WaypointsPilot(StrictModel):
         return self
 
 
+PlannedPilot = Annotated[
+    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot, Field(discriminator="kind")
+]
+
+
+class PolicyPilot(StrictModel):
+    """A program that computes actions during the run: a trained policy, a Python function or a plug-in.
+
+    `policy` is a file of stable-baselines3 (`.zip`), TorchScript (`.pt`) or ONNX (`.onnx`), relative to the
+    folder of the scenario; `module:function` or `FILE.py:function`; or the name of a plug-in of the group
+    `hydrotele.pilots`. It runs with all rights of the user: use only files that you trust.
+
+    `observation` lists the values that it receives, by the names of the environments, such as
+    `angle.boom`, `pressure_head.boom`, `tip.r`, `command.boom`, `reference.boom` or
+    `reference_in_100_ms.boom`. Without it, a Python function receives a `PilotState`. `reference` is another
+    pilot; its joint references or tip poses are those to follow.
+
+    `action` is the kind of its actions, each from -1 to 1: `valve` (commands), `joint_rate` (rates of the
+    axes) or `resolved_motion` (rates of the tip), as in environments; `axes` are the driven axes, by default
+    those of the arm and then the others. `rate` [Hz] is the number of actions per second, and `pose_rates`
+    the tip rates of full actions: r [m/s], theta [rad/s], z [m/s], attitude, head [rad/s]. Values that are
+    not given are those of the program, or else `valve`, 50 Hz and those of the environments.
+    """
+
+    kind: Literal["policy"]
+    policy: Annotated[str, Field(min_length=1)]
+    observation: tuple[str, ...] = ()
+    axes: tuple[Name, ...] = ()
+    action: Literal["valve", "joint_rate", "resolved_motion"] | None = None
+    rate: PositiveFloat | None = None
+    pose_rates: tuple[PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat] | None = None
+    reference: PlannedPilot | None = None
+
+
 Pilot = Annotated[
-    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot | TeleopPilot,
+    ConstantPilot | TablePilot | FourierPilot | LinesPilot | WaypointsPilot | TeleopPilot | PolicyPilot,
     Field(discriminator="kind"),
 ]

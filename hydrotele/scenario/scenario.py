@@ -27,7 +27,7 @@ from hydrotele.core.files import models_folder, resolve_path, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.oil import Temperature
-from hydrotele.scenario.pilots import Pilot, Pose, TablePilot, check_size_limit
+from hydrotele.scenario.pilots import Pilot, PolicyPilot, Pose, TablePilot, check_size_limit
 from hydrotele.scenario.surrounding_objects import SurroundingObject
 from hydrotele.scenario.teleoperation import TeleopPilot
 
@@ -249,6 +249,9 @@ def _load_pilot_table(scenario: Scenario, where: str) -> Scenario:
     Raises:
         InputError: the log cannot be read, or has no column of the pilot's quantity.
     """
+    if isinstance(scenario.pilot, PolicyPilot) and scenario.pilot.reference is not None:
+        inner = _load_pilot_table(scenario.model_copy(update={"pilot": scenario.pilot.reference}), where)
+        return scenario.model_copy(update={"pilot": scenario.pilot.model_copy(update={"reference": inner.pilot})})
     pilot = scenario.pilot
     if not isinstance(pilot, TablePilot) or pilot.file is None:
         return scenario
@@ -315,7 +318,7 @@ def with_absolute_paths(scenario: Scenario) -> Scenario:
     """Return the scenario with absolute paths of its files, so that they do not depend on its folder.
 
     These are the user's machine, force model and joystick, the recorded motion, the trace of packet
-    delays, the operator file, and the table of a table pilot.
+    delays, the operator file, the table of a table pilot, and the file of a policy.
     """
     changes: dict[str, Any] = {}
     if machine := find_local_machine(scenario):
@@ -330,6 +333,13 @@ def with_absolute_paths(scenario: Scenario) -> Scenario:
     pilot = scenario.pilot
     if isinstance(pilot, TablePilot):
         changes["pilot"] = with_absolute_path(pilot, "file")
+    elif isinstance(pilot, PolicyPilot):
+        place, colon, name = pilot.policy.rpartition(":")
+        file = Path(scenario.folder, place if colon else name)
+        if scenario.folder and file.is_file():
+            changes["pilot"] = pilot.model_copy(
+                update={"policy": f"{resolve_path(file)}{colon}{name if colon else ''}"}
+            )
     elif isinstance(pilot, TeleopPilot):
         changes["pilot"] = pilot.model_copy(update={
             "operator": with_absolute_path(pilot.operator, "recorded"),

@@ -127,6 +127,10 @@ class SimulationBatch:
         """Copy the mjData of simulation `number` into `data`, which must have the same sizes."""
         self._library.mjb_getData(self._require_native().handle, number, data._address)
 
+    def require_open(self) -> None:
+        """Raise RuntimeError if the simulations are closed or belong to a parent process."""
+        self._require_native()
+
     def _require_native(self) -> _NativeBatch:
         """Return the native batch; raise RuntimeError if it is closed or belongs to a parent process."""
         if self._native is None:

@@ -28,7 +28,8 @@ acceleration.
 simulation became unstable (`info["fault"]`, never seen in ten million random steps). A step of a
 single environment after the end is an error: call `reset` first.
 `reset(seed=...)` gives the same bits again, alone, batched, on any number of threads; a batch's
-environment i has the seed of the first one plus i.
+environment i has the seed of the first one plus i. `env.unwrapped.get_state()` returns the complete
+state, and `set_state(state)` continues from it with the same bits.
 
 **Info**: the task's figures, below; `variant`: which machine and start of those drawn
 (`env.unwrapped.core.setup.variants`).
@@ -78,7 +79,7 @@ def _section(task: Task) -> str:
         f"{task.description} {task.reward}",
         "",
         f"Machine `{task.machine}`, tool `{setup.machine.tool}`, {setup.options.duration:g} s,"
-        f' `action="{setup.options.action}"` by default.',
+        f' `action="{setup.options.action}"` by default. Another machine needs {", ".join(_needs(task))}.',
         f"Info: {', '.join(f'`{name}` [{unit}]' for name, unit in task.measures)}.",
         "",
         *((NOTES[task.name], "") if task.name in NOTES else ()),
@@ -89,6 +90,11 @@ def _section(task: Task) -> str:
     ]
     lines += [f"| {field.name} | {field.unit} | {field.low:.4g} | {field.high:.4g} |" for field in setup.fields]
     return "\n".join(lines)
+
+
+def _needs(task: Task) -> list[str]:
+    """Joints of the arm, names of joints and axes."""
+    return [f"`{name}`" for name in dict.fromkeys((*task.needs, *task.extra_axes))]
 
 
 def _actions(setup: TaskSetup, kind: str) -> str:
