@@ -11,7 +11,7 @@ from gymnasium.envs.registration import register
 
 TASK_NAMES = (
     "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller", "Grade",
-    "PlaceLog",
+    "PlaceLog", "LoadTruck",
 )  # fmt: skip
 
 for _name in TASK_NAMES:

@@ -6,7 +6,7 @@ whether it stays in the workspace.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import compiled
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES, arm_values
 from hydrotele.envs.observation import ObservationField
@@ -54,6 +55,7 @@ class Task:
         pose_rates: tip rates at full action: r [m/s], theta [rad/s], z [m/s], attitude, head
             [rad/s].
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
+        phases: name -> the task for one phase only, for the option `phase`.
     """
 
     name: str
@@ -78,6 +80,20 @@ class Task:
     written_fields: tuple[str, ...] = ()
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
     servo: Servo = Servo()
+    phases: Mapping[str, "Task"] = dataclasses.field(default_factory=dict)
+
+    def choose_phase(self, phase: str | None) -> "Task":
+        """Return the task for one of its phases, or the task itself for None.
+
+        Raises:
+            InputError: the task has no such phase.
+        """
+        if phase is None:
+            return self
+        if phase not in self.phases:
+            known = suggest_valid_name(phase, self.phases) if self.phases else f"{self.name} has no phases"
+            raise InputError(f"phase {phase!r}", known)
+        return self.phases[phase]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,6 +113,8 @@ class Options:
         variants: number of random machines and starts; every episode uses one of them.
         variant_seed: seed for drawing the variants.
         timestep: physics step [s].
+        phase: phase of the task that an episode consists of, for a curriculum; only for tasks with phases
+            (`LoadTruck`: `dig`, `haul`, `dump`, `return`, `cycle`).
     """
 
     action: ActionKind | None = None
@@ -108,6 +126,7 @@ class Options:
     variants: int = 64
     variant_seed: int = 0
     timestep: float = 1.0e-3
+    phase: str | None = None
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
