@@ -83,7 +83,7 @@ CYCLE, DIG, HAUL, DUMP, RETURN = range(5)
 FIRST_RADIUS, LAST_RADIUS = 4.5, 8.5  # m, radii between which the profile of the bank is observed
 SECTION_COUNT = 20  # number of profile sections whose mean height is observed
 LOAD_SECTION_COUNT = 10  # number of sections of the load whose mean height is observed
-FULL_LOAD = 6.0  # m^3, loose volume that fills the truck
+FULL_LOAD = 5.0  # m^3, loose volume that fills the truck
 FULL_BUCKET = 0.6  # m^3, loose volume that counts as a full bucket
 DIG_RADIUS, DIG_HEIGHT = 6.6, 0.5  # m, radius, and height above the bank, of the place where digging starts
 VOLUME_REWARD = 10.0  # reward per m^3 in the truck
@@ -492,15 +492,15 @@ _CYCLE_TASK = Task(
     kind="load",
     description=(
         "An excavator digs soft, loamy or firm soil from a bank 0.5 to 1 m high, lifts it, swings by 70 to 110 deg,"
-        " dumps it into the bed of a truck with walls 2 m high, and returns, until 6 m3 of loose soil are in the"
+        " dumps it into the bed of a truck with walls 1.9 m high, and returns, until 5 m3 of loose soil are in the"
         " truck. `phase` makes an episode of a single phase: `dig`, `haul`, `dump` or `return`."
     ),
     reward=(
         "The reward is 10 per m3 in the truck, minus 10 per m3 spilled, 1 per MJ of hydraulic energy, 0.1 per second"
         " and 1 per 10 kN s of force on the truck. A potential is added whose sum over an episode depends only on"
         " its ends: 10 per m3 in the bucket times a value that rises from 0.3 to 0.7 on the way to the truck, and"
-        " for an empty bucket -2 on the way from the bank. Success ends the episode with 10: `cycle` 6 m3 loaded,"
-        " `dig` 0.6 m3 lifted 0.3 m above the bank, `haul` the load above the bed, `dump` the bucket empty and 80 %"
+        " for an empty bucket -2 on the way from the bank. Success ends the episode with 10: `cycle` 5 m3 loaded,"
+        " `dig` 0.5 m3 lifted 0.3 m above the bank, `haul` the load above the bed, `dump` the bucket empty and 80 %"
         " of it in the truck, `return` the edge above the bank. A force above 100 kN on the truck ends it with -20."
     ),
     machine="cat215",

@@ -31,8 +31,8 @@ from hydrotele.soil.parameters import (
 )
 from hydrotele.soil.step import MIN_SPILL_RATE, SPILL_TIME, compute_bucket_capacity
 
-TRUCK = DumpTruck(position=(0.0, 5.8), direction=math.pi / 2.0)
-"""The truck: a two-axle dump truck of 18 t, left of the machine, rear towards it. Its bed holds 6.4 m^3 struck."""
+TRUCK = DumpTruck(position=(0.0, 5.5), direction=math.pi / 2.0, wall_height=0.6)
+"""The truck: a two-axle dump truck of 18 t, left of the machine, rear towards it. Its bed holds 5.5 m^3 struck."""
 LOAD_CELL_COUNT = 40
 LOAD_CELL_LENGTH = TRUCK.length / LOAD_CELL_COUNT  # m
 STRUCK_VOLUME = TRUCK.length * TRUCK.width * TRUCK.wall_height  # m^3

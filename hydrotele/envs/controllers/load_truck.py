@@ -19,7 +19,7 @@ from hydrotele.envs.controllers.controller import (
 )
 from hydrotele.envs.controllers.rate_feedback import RateFeedback
 from hydrotele.envs.episode import MAX_ARM_AXES
-from hydrotele.envs.load_truck import LOAD_SECTION_COUNT, SECTION_COUNT, profile_section_radii
+from hydrotele.envs.load_truck import BANK_HALF_ANGLE, LOAD_SECTION_COUNT, SECTION_COUNT, profile_section_radii
 from hydrotele.envs.task_setup import MAX_ACCELERATION, MAX_POSE_ACCELERATIONS, TaskSetup, full_action_rate
 from hydrotele.envs.truck_bed import RAIL_HEIGHT, TRUCK
 
@@ -33,26 +33,28 @@ _BRAKING_GAIN = 4.0  # 1/s, gain of a reference close to its goal
 
 READY, ENTER, DRAW, CURL, HAUL, DUMP = range(6)
 R, THETA, Z, ATTITUDE = range(4)
-_CUT_LENGTH, _CUT_DEPTH = 2.0, 0.26  # m
-_START_RADII = np.linspace(6.7, 7.3, 7)  # m, possible radii at which a cut starts
+_CUT_LENGTH, _CUT_AREA = 1.9, 0.65  # m, m^2 of soil above the bottom of a cut
+_START_RADII = np.linspace(6.2, 7.4, 13)  # m, possible radii at which a cut starts
 _LOWEST_CUT = -1.6  # m
-_READY_HEIGHT, _READY_ATTITUDE = 0.3, -72.0 * _DEGREE  # m above the bank
-_CUT_ATTITUDES = (-82.0 * _DEGREE, -112.0 * _DEGREE)  # at the start and the end of a cut
+_HALVINGS = 12  # of the interval of the bottom's height, to 1 mm
+_READY_HEIGHT, _READY_ATTITUDE = 0.25, -64.0 * _DEGREE  # m above the bank
+_CUT_ATTITUDES = (-80.0 * _DEGREE, -132.0 * _DEGREE)  # at the start and the end of a cut
 _ENTRY_LENGTH = 0.4  # m, horizontal way while the edge enters the ground
-_CUT_RATES = np.array([0.7, 0.4, 0.45])  # m/s, m/s, rad/s: r, z, attitude
+_CUT_RATES = np.array([0.7, 0.6, 0.48])  # m/s, m/s, rad/s: r, z, attitude
 _CUT_ACCELERATIONS = np.array([1.5, 1.5, 1.5])  # m/s^2, m/s^2, rad/s^2
 _FULL_MASS = 1050.0  # kg, mass carried that ends a cut
 _MAX_CUT_TIME = 6.0  # s
-_CURL_ATTITUDE, _CURL_RISE = -165.0 * _DEGREE, 0.8  # rad, m
+_CURL_ATTITUDE, _CURL_LENGTH, _CURL_RISE = -165.0 * _DEGREE, 0.6, 0.3  # rad, m, m
 _CURLED_ATTITUDE = -148.0 * _DEGREE  # attitude at which hauling starts
 _CARRY_ATTITUDE, _DUMP_ATTITUDE = -168.0 * _DEGREE, -66.0 * _DEGREE
 _BUCKET_DEPTH = 0.68  # m by which the heel of a curled bucket is lower than its edge
 _CLEARANCE = 0.15  # m between bucket and bank before the swing starts
 _RAIL_CLEARANCE = 0.2  # m between bucket and walls of the truck
-_DUMP_RADII = (4.9, 6.3)  # m, range of the radius of the bucket's pin while dumping
+_DUMP_RADII = (4.8, 6.5)  # m, range of the radius of the bucket's pin while dumping
 _FALL_OFFSET = 0.4  # m by which the soil falls closer to the machine than the pin
-_LEAVE_ANGLE = 0.35  # rad between arm and truck before the arm is lowered
-_DUMP_ANGLE = 0.12  # rad before the middle of the bed at which the bucket starts to open
+_ARRIVE_ANGLE = 0.5  # rad between arm and truck at which the swing waits for the boom
+_LEAVE_ANGLE = 0.35  # rad between arm and truck before the boom is lowered
+_DUMP_ANGLE = 0.25  # rad before the middle of the bed at which the bucket starts to open
 _EMPTY_MASS = 40.0  # kg
 _READY_TOLERANCE = 0.07  # rad
 
@@ -165,7 +167,8 @@ class LoadTruckController:
         self._time += self._dt
         phase, mass = self.phase, seen[:, self._mass]
         waiting = phase == READY  # the cut is planned until it starts
-        self._start[waiting] = self._plan_cut(seen[:, self._bank])[waiting]
+        start, bottom = self._plan_cut(seen[:, self._bank])
+        self._start[waiting], self._bottom[waiting] = start[waiting], bottom[waiting]
         carrying = (phase == CURL) | (phase == HAUL)
         self._pin[carrying] = self._plan_dump(seen[:, self._load])[carrying]
         pose = tip_poses(self._arm, self._q)
@@ -177,34 +180,39 @@ class LoadTruckController:
             [phase == p for p in range(6)],
             [
                 ready,
-                pose[:, R] < self._start - 0.9 * _ENTRY_LENGTH,
+                pose[:, Z] < self._bottom + 0.05,
                 (pose[:, R] < end + 0.05) | (mass > _FULL_MASS) | (self._time > _MAX_CUT_TIME),
                 (tip[:, ATTITUDE] < _CURLED_ATTITUDE) | (self._time > _MAX_CUT_TIME),
-                (swing_error < _DUMP_ANGLE) & (tip[:, Z] - _BUCKET_DEPTH > RAIL_HEIGHT + 0.1),
-                (mass < _EMPTY_MASS) & (tip[:, ATTITUDE] > _DUMP_ATTITUDE - 0.4),
+                (swing_error < _DUMP_ANGLE) & (tip[:, Z] - _BUCKET_DEPTH > RAIL_HEIGHT + _RAIL_CLEARANCE / 2.0),
+                mass < _EMPTY_MASS,
             ],
         ).astype(bool)
-        curled = done & (phase == DRAW)
-        self._bottom[curled] = pose[curled, Z]
         phase[done] = (phase[done] + 1) % 6
         self._time[done] = 0.0
         self._speed[done & (phase == ENTER)] = 0.0
 
-    def _plan_cut(self, bank: np.ndarray) -> np.ndarray:
-        """Return the radius (n,) at which a cut starts: where most soil lies above the lowest cut [m].
+    def _plan_cut(self, bank: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the radius (n,) at which a cut starts, and the height (n,) of its level bottom [m].
 
-        `bank` (n, SECTION_COUNT) are the heights of the bank [m].
+        Of all cuts with the wanted area of soil above their bottom, the one with the highest bottom
+        is taken. `bank` (n, SECTION_COUNT) are the heights of the bank [m].
         """
         inside = (self._radii < _START_RADII[:, None]) & (self._radii > _START_RADII[:, None] - _CUT_LENGTH)
-        mean = bank @ (inside / inside.sum(1, keepdims=True)).T
-        return _START_RADII[mean.argmax(1)]
+        width = self._radii[1] - self._radii[0]
+        low, high = np.full((len(bank), len(inside)), _LOWEST_CUT), np.full((len(bank), len(inside)), bank.max())
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            area = width * (inside * np.maximum(bank[:, None] - middle[:, :, None], 0.0)).sum(2)
+            low, high = np.where(area > _CUT_AREA, middle, low), np.where(area > _CUT_AREA, high, middle)
+        best = low.argmax(1)
+        return _START_RADII[best], low[np.arange(len(bank)), best]
 
     def _plan_dump(self, load: np.ndarray) -> np.ndarray:
         """Return the radius (n,) of the bucket's pin at which the soil falls where the load is lowest [m].
 
         `load` (n, LOAD_SECTION_COUNT) are the heights of the load [m].
         """
-        reachable = (self._bed_radii > _DUMP_RADII[0] - _FALL_OFFSET) & (self._bed_radii < _DUMP_RADII[1])
+        reachable = (self._bed_radii > _DUMP_RADII[0] - _FALL_OFFSET) & (self._bed_radii < _DUMP_RADII[1] + 0.3)
         lowest = np.where(reachable, load, np.inf).argmin(1)
         return np.clip(self._bed_radii[lowest] + _FALL_OFFSET, *_DUMP_RADII)
 
@@ -231,16 +239,18 @@ class LoadTruckController:
     def _move_rates(self, seen: np.ndarray, tip: np.ndarray) -> np.ndarray:
         """Return the joint rates (n, 4) towards the goal of a move [rad/s].
 
-        The swing waits until a loaded bucket is above the bank. The arm waits until an empty bucket
-        has left the truck.
+        A loaded bucket swings only above the bank, and to the truck only above its walls. An empty one
+        is lowered only beside the truck.
         """
         left = self._goal_joints(seen) - self._q
-        highest = seen[:, self._bank].max(1)
-        low = tip[:, Z] - _BUCKET_DEPTH < highest + _CLEARANCE
-        near_bank = np.abs(seen[:, self._to_bank]) < 0.6
-        left[(self.phase == HAUL) & low & near_bank, 0] = 0.0
-        leaving = (self.phase == READY) & (np.abs(seen[:, self._to_truck]) < _LEAVE_ANGLE)
-        left[leaving, 1:] = 0.0
+        hauling, to_truck = self.phase == HAUL, np.abs(seen[:, self._to_truck])
+        lowest = tip[:, Z] - _BUCKET_DEPTH
+        in_bank = (np.abs(seen[:, self._to_bank]) < BANK_HALF_ANGLE) & (lowest < seen[:, self._bank].max(1) + _CLEARANCE)
+        below_rail = lowest < RAIL_HEIGHT + _RAIL_CLEARANCE / 2.0
+        swing = np.sign(left[:, 0]) * np.maximum(np.abs(left[:, 0]) - _ARRIVE_ANGLE, 0.0)
+        left[:, 0] = np.where(hauling & in_bank, 0.0, np.where(hauling & below_rail, swing, left[:, 0]))
+        leaving = (self.phase == READY) & (to_truck < _LEAVE_ANGLE)
+        left[leaving, 1] = np.maximum(left[leaving, 1], 0.0)
         size = np.abs(left)
         brake = np.sqrt(2.0 * 0.8 * _ACCELERATION_SHARE * MAX_ACCELERATION * size)
         return np.sign(left) * np.minimum(np.minimum(self._fastest, brake), _BRAKING_GAIN * size)
@@ -250,17 +260,15 @@ class LoadTruckController:
         phase, pose = self.phase, np.zeros((len(seen), MAX_ARM_AXES))
         pose[:, :4] = tip_poses(self._arm, self._q)
         here = pose[:, R]
-        end = self._start - _CUT_LENGTH
-        smooth = np.mean([self._bank_height_at(seen, here + d) for d in (-0.6, -0.3, 0.0)], axis=0)
-        cut = np.maximum(smooth - _CUT_DEPTH, _LOWEST_CUT)
+        end, cut = self._start - _CUT_LENGTH, self._bottom
         part = np.clip((self._start - here) / _CUT_LENGTH, 0.0, 1.0)
         blade = _CUT_ATTITUDES[0] + part * (_CUT_ATTITUDES[1] - _CUT_ATTITUDES[0])
         choice = phase - ENTER
         clipped = np.clip(choice, 0, 2)
         goal = np.stack([
-            np.choose(clipped, [self._start - _ENTRY_LENGTH, end - 0.3, np.maximum(here, 4.3)]),
+            np.choose(clipped, [self._start - _ENTRY_LENGTH, end - 0.3, end - _CURL_LENGTH]),
             np.choose(clipped, [cut, cut, self._bottom + _CURL_RISE]),
-            np.choose(clipped, [blade, blade, np.full_like(here, _CURL_ATTITUDE)]),
+            np.choose(clipped, [np.full_like(here, _READY_ATTITUDE), blade, np.full_like(here, _CURL_ATTITUDE)]),
         ], axis=1)  # fmt: skip
         wanted = np.clip(3.0 * (goal - pose[:, [R, Z, ATTITUDE]]), -_CUT_RATES, _CUT_RATES)
         change = _CUT_ACCELERATIONS * self._dt
