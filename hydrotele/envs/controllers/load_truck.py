@@ -33,30 +33,32 @@ _BRAKING_GAIN = 4.0  # 1/s, gain of a reference close to its goal
 
 READY, ENTER, DRAW, CURL, HAUL, DUMP = range(6)
 R, THETA, Z, ATTITUDE = range(4)
-_CUT_LENGTH, _CUT_AREA = 1.9, 0.65  # m, m^2 of soil above the bottom of a cut
+_CUT_LENGTH, _CUT_AREA = 1.9, 0.75  # m, m^2 of soil above the bottom of a cut
 _START_RADII = np.linspace(6.2, 7.4, 13)  # m, possible radii at which a cut starts
 _LOWEST_CUT = -1.6  # m
 _HALVINGS = 12  # of the interval of the bottom's height, to 1 mm
-_READY_HEIGHT, _READY_ATTITUDE = 0.25, -64.0 * _DEGREE  # m above the bank
-_CUT_ATTITUDES = (-80.0 * _DEGREE, -132.0 * _DEGREE)  # at the start and the end of a cut
+_READY_HEIGHT = 0.25  # m above the bank
+_ENTRY_ATTITUDES = (6.2, 7.0), (-81.0 * _DEGREE, -66.0 * _DEGREE)  # start of the cut [m] -> attitude of the entry
+_CUT_ATTITUDES = (-80.0 * _DEGREE, -123.0 * _DEGREE)  # at the start and the end of a cut
 _ENTRY_LENGTH = 0.4  # m, horizontal way while the edge enters the ground
 _CUT_RATES = np.array([0.7, 0.6, 0.48])  # m/s, m/s, rad/s: r, z, attitude
 _CUT_ACCELERATIONS = np.array([1.5, 1.5, 1.5])  # m/s^2, m/s^2, rad/s^2
 _FULL_MASS = 1050.0  # kg, mass carried that ends a cut
 _MAX_CUT_TIME = 6.0  # s
-_CURL_ATTITUDE, _CURL_LENGTH, _CURL_RISE = -165.0 * _DEGREE, 0.6, 0.3  # rad, m, m
+_CURL_ATTITUDE, _CURL_LENGTH, _CURL_RISE = -165.0 * _DEGREE, 0.75, 0.2  # rad, m, m
 _CURLED_ATTITUDE = -148.0 * _DEGREE  # attitude at which hauling starts
 _CARRY_ATTITUDE, _DUMP_ATTITUDE = -168.0 * _DEGREE, -66.0 * _DEGREE
 _BUCKET_DEPTH = 0.68  # m by which the heel of a curled bucket is lower than its edge
 _CLEARANCE = 0.15  # m between bucket and bank before the swing starts
 _RAIL_CLEARANCE = 0.2  # m between bucket and walls of the truck
 _DUMP_RADII = (4.8, 6.5)  # m, range of the radius of the bucket's pin while dumping
+_DUMP_RISE = 0.15  # m by which the edge is lower while the bucket opens
 _FALL_OFFSET = 0.4  # m by which the soil falls closer to the machine than the pin
 _ARRIVE_ANGLE = 0.5  # rad between arm and truck at which the swing waits for the boom
 _LEAVE_ANGLE = 0.35  # rad between arm and truck before the boom is lowered
 _DUMP_ANGLE = 0.25  # rad before the middle of the bed at which the bucket starts to open
 _EMPTY_MASS = 40.0  # kg
-_READY_TOLERANCE = 0.07  # rad
+_READY_TOLERANCES = np.array([0.05, 0.07, 0.07, 0.07])  # rad
 
 
 class JointFollower:
@@ -175,7 +177,7 @@ class LoadTruckController:
         swing_error = np.abs(seen[:, self._to_truck])
         end = self._start - _CUT_LENGTH
         near = np.abs(self._goal_joints(seen) - joint)
-        ready = (near.max(1) < _READY_TOLERANCE) & (np.abs(self._rate).max(1) < 0.1)
+        ready = ((near / _READY_TOLERANCES).max(1) < 1.0) & (np.abs(self._rate).max(1) < 0.1)
         done = np.select(
             [phase == p for p in range(6)],
             [
@@ -223,16 +225,15 @@ class LoadTruckController:
         """Return the joint angles (n, 4) at the end of the moves READY, HAUL and DUMP [rad]."""
         phase, theta = self.phase, seen[:, self._tip[THETA]]
         pose, q = np.zeros((len(seen), MAX_ARM_AXES)), self._q.copy()
-        above = self._bank_height_at(seen, self._start)
+        above = seen[:, self._bank].max(1)  # the sides of the trench are as high as the bank
         carry, reach = TOOL_LENGTH * np.cos(_CARRY_ATTITUDE), TOOL_LENGTH * np.cos(_DUMP_ATTITUDE)
         hauling, dumping = phase == HAUL, phase == DUMP
         pose[:, R] = np.where(hauling, self._pin + carry, np.where(dumping, self._pin + reach, self._start))
         pose[:, THETA] = theta + np.where(hauling | dumping, seen[:, self._to_truck], seen[:, self._to_bank])
         high = RAIL_HEIGHT + _RAIL_CLEARANCE
-        pose[:, Z] = np.where(hauling, high + _BUCKET_DEPTH, np.where(dumping, high, above + _READY_HEIGHT))
-        pose[:, ATTITUDE] = np.choose(
-            np.select([hauling, dumping], [1, 2], 0), [_READY_ATTITUDE, _CARRY_ATTITUDE, _DUMP_ATTITUDE]
-        )
+        pose[:, Z] = np.where(hauling, high + _BUCKET_DEPTH, np.where(dumping, high + _DUMP_RISE, above + _READY_HEIGHT))
+        entry = np.interp(self._start, *_ENTRY_ATTITUDES)
+        pose[:, ATTITUDE] = np.where(hauling, _CARRY_ATTITUDE, np.where(dumping, _DUMP_ATTITUDE, entry))
         compute_joint_angles(self._arm, self._ranges, pose, q)
         return q
 
@@ -250,7 +251,8 @@ class LoadTruckController:
         swing = np.sign(left[:, 0]) * np.maximum(np.abs(left[:, 0]) - _ARRIVE_ANGLE, 0.0)
         left[:, 0] = np.where(hauling & in_bank, 0.0, np.where(hauling & below_rail, swing, left[:, 0]))
         leaving = (self.phase == READY) & (to_truck < _LEAVE_ANGLE)
-        left[leaving, 1] = np.maximum(left[leaving, 1], 0.0)
+        left[leaving, 1:3] = np.maximum(left[leaving, 1:3], 0.0)
+        left[leaving & (tip[:, Z] < RAIL_HEIGHT + _RAIL_CLEARANCE / 2.0), 0] = 0.0
         size = np.abs(left)
         brake = np.sqrt(2.0 * 0.8 * _ACCELERATION_SHARE * MAX_ACCELERATION * size)
         return np.sign(left) * np.minimum(np.minimum(self._fastest, brake), _BRAKING_GAIN * size)
@@ -268,7 +270,7 @@ class LoadTruckController:
         goal = np.stack([
             np.choose(clipped, [self._start - _ENTRY_LENGTH, end - 0.3, end - _CURL_LENGTH]),
             np.choose(clipped, [cut, cut, self._bottom + _CURL_RISE]),
-            np.choose(clipped, [np.full_like(here, _READY_ATTITUDE), blade, np.full_like(here, _CURL_ATTITUDE)]),
+            np.choose(clipped, [np.interp(self._start, *_ENTRY_ATTITUDES), blade, np.full_like(here, _CURL_ATTITUDE)]),
         ], axis=1)  # fmt: skip
         wanted = np.clip(3.0 * (goal - pose[:, [R, Z, ATTITUDE]]), -_CUT_RATES, _CUT_RATES)
         change = _CUT_ACCELERATIONS * self._dt
