@@ -84,7 +84,7 @@ FIRST_RADIUS, LAST_RADIUS = 4.5, 8.5  # m, radii between which the profile of th
 SECTION_COUNT = 20  # number of profile sections whose mean height is observed
 LOAD_SECTION_COUNT = 10  # number of sections of the load whose mean height is observed
 FULL_LOAD = 5.0  # m^3, loose volume that fills the truck
-FULL_BUCKET = 0.6  # m^3, loose volume that counts as a full bucket
+FULL_BUCKET = 0.45  # m^3, loose volume that counts as a full bucket
 DIG_RADIUS, DIG_HEIGHT = 6.6, 0.5  # m, radius, and height above the bank, of the place where digging starts
 VOLUME_REWARD = 10.0  # reward per m^3 in the truck
 SPILL_COST = 10.0  # per m^3
@@ -506,7 +506,7 @@ _CYCLE_TASK = Task(
     machine="cat215",
     tool="bucket",
     action="joint_rate",
-    duration=180.0,
+    duration=240.0,
     fields=list_load_observation_fields,
     measures=(
         ("loaded_volume", "m3"), ("carried_volume", "m3"), ("spilled_volume", "m3"), ("removed_volume", "m3"),

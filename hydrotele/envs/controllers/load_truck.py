@@ -41,11 +41,12 @@ _READY_HEIGHT = 0.25  # m above the bank
 _ENTRY_ATTITUDES = (6.2, 7.0), (-81.0 * _DEGREE, -66.0 * _DEGREE)  # start of the cut [m] -> attitude of the entry
 _CUT_ATTITUDES = (-80.0 * _DEGREE, -123.0 * _DEGREE)  # at the start and the end of a cut
 _ENTRY_LENGTH = 0.4  # m, horizontal way while the edge enters the ground
-_CUT_RATES = np.array([0.7, 0.6, 0.48])  # m/s, m/s, rad/s: r, z, attitude
+_CUT_RATES = np.array([0.7, 1.0, 0.48])  # m/s, m/s, rad/s: r, z, attitude
 _CUT_ACCELERATIONS = np.array([1.5, 1.5, 1.5])  # m/s^2, m/s^2, rad/s^2
 _FULL_MASS = 1050.0  # kg, mass carried that ends a cut
 _MAX_CUT_TIME = 6.0  # s
-_CURL_ATTITUDE, _CURL_LENGTH, _CURL_RISE = -165.0 * _DEGREE, 0.75, 0.2  # rad, m, m
+_CURL_ATTITUDE, _CURL_LENGTH, _CURL_RISE = -165.0 * _DEGREE, 0.75, (0.2, 0.75)  # rad, m, m
+_FREE_DEPTH = 0.4  # m, depth of a trench that needs no ramp at its inner end
 _CURLED_ATTITUDE = -148.0 * _DEGREE  # attitude at which hauling starts
 _CARRY_ATTITUDE, _DUMP_ATTITUDE = -168.0 * _DEGREE, -66.0 * _DEGREE
 _BUCKET_DEPTH = 0.68  # m by which the heel of a curled bucket is lower than its edge
@@ -58,7 +59,7 @@ _ARRIVE_ANGLE = 0.5  # rad between arm and truck at which the swing waits for th
 _LEAVE_ANGLE = 0.35  # rad between arm and truck before the boom is lowered
 _DUMP_ANGLE = 0.25  # rad before the middle of the bed at which the bucket starts to open
 _EMPTY_MASS = 40.0  # kg
-_READY_TOLERANCES = np.array([0.05, 0.07, 0.07, 0.07])  # rad
+_READY_TOLERANCES = np.array([0.05, 0.1, 0.1, 0.15])  # rad
 
 
 class JointFollower:
@@ -177,7 +178,7 @@ class LoadTruckController:
         swing_error = np.abs(seen[:, self._to_truck])
         end = self._start - _CUT_LENGTH
         near = np.abs(self._goal_joints(seen) - joint)
-        ready = ((near / _READY_TOLERANCES).max(1) < 1.0) & (np.abs(self._rate).max(1) < 0.1)
+        ready = ((near / _READY_TOLERANCES).max(1) < 1.0) & (np.abs(self._rate[:, 0]) < 0.1)
         done = np.select(
             [phase == p for p in range(6)],
             [
@@ -263,13 +264,14 @@ class LoadTruckController:
         pose[:, :4] = tip_poses(self._arm, self._q)
         here = pose[:, R]
         end, cut = self._start - _CUT_LENGTH, self._bottom
+        rise = np.clip(seen[:, self._bank].max(1) - cut - _FREE_DEPTH, *_CURL_RISE)  # a deep trench gets a ramp
         part = np.clip((self._start - here) / _CUT_LENGTH, 0.0, 1.0)
         blade = _CUT_ATTITUDES[0] + part * (_CUT_ATTITUDES[1] - _CUT_ATTITUDES[0])
         choice = phase - ENTER
         clipped = np.clip(choice, 0, 2)
         goal = np.stack([
             np.choose(clipped, [self._start - _ENTRY_LENGTH, end - 0.3, end - _CURL_LENGTH]),
-            np.choose(clipped, [cut, cut, self._bottom + _CURL_RISE]),
+            np.choose(clipped, [cut, cut, self._bottom + rise]),
             np.choose(clipped, [np.interp(self._start, *_ENTRY_ATTITUDES), blade, np.full_like(here, _CURL_ATTITUDE)]),
         ], axis=1)  # fmt: skip
         wanted = np.clip(3.0 * (goal - pose[:, [R, Z, ATTITUDE]]), -_CUT_RATES, _CUT_RATES)
