@@ -33,7 +33,7 @@ _BRAKING_GAIN = 4.0  # 1/s, gain of a reference close to its goal
 
 READY, ENTER, DRAW, CURL, HAUL, DUMP = range(6)
 R, THETA, Z, ATTITUDE = range(4)
-_CUT_LENGTH, _CUT_AREA = 1.9, 0.75  # m, m^2 of soil above the bottom of a cut
+_CUT_LENGTH, _CUT_AREA = 1.9, 0.65  # m, m^2 of soil above the bottom of a cut
 _START_RADII = np.linspace(6.2, 7.4, 13)  # m, possible radii at which a cut starts
 _LOWEST_CUT = -1.6  # m
 _HALVINGS = 12  # of the interval of the bottom's height, to 1 mm
@@ -200,7 +200,8 @@ class LoadTruckController:
         Of all cuts with the wanted area of soil above their bottom, the one with the highest bottom
         is taken. `bank` (n, SECTION_COUNT) are the heights of the bank [m].
         """
-        inside = (self._radii < _START_RADII[:, None]) & (self._radii > _START_RADII[:, None] - _CUT_LENGTH)
+        before = _START_RADII[:, None] - self._radii
+        inside = (before > _ENTRY_LENGTH) & (before < _CUT_LENGTH + 0.5 * _CURL_LENGTH)
         width = self._radii[1] - self._radii[0]
         low, high = np.full((len(bank), len(inside)), _LOWEST_CUT), np.full((len(bank), len(inside)), bank.max())
         for _ in range(_HALVINGS):
