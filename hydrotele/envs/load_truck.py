@@ -500,7 +500,7 @@ _CYCLE_TASK = Task(
         " and 1 per 10 kN s of force on the truck. A potential is added whose sum over an episode depends only on"
         " its ends: 10 per m3 in the bucket times a value that rises from 0.3 to 0.7 on the way to the truck, and"
         " for an empty bucket -2 on the way from the bank. Success ends the episode with 10: `cycle` 5 m3 loaded,"
-        " `dig` 0.5 m3 lifted 0.3 m above the bank, `haul` the load above the bed, `dump` the bucket empty and 80 %"
+        " `dig` 0.45 m3 lifted 0.3 m above the bank, `haul` the load above the bed, `dump` the bucket empty and 80 %"
         " of it in the truck, `return` the edge above the bank. A force above 100 kN on the truck ends it with -20."
     ),
     machine="cat215",
