@@ -1,7 +1,7 @@
 """The task `LoadTruck`: dig soil from a bank, swing, dump it into the bed of a truck, and return.
 
 The bank is a strip of soil as wide as the bucket, at an azimuth that is drawn for every episode.
-The truck stands to the left of the machine. Beside the strip the ground has the undisturbed height
+The truck stands to the left of the machine. Next to the strip the ground has the undisturbed height
 of the bank; it only resists a bucket that swings sideways through it.
 """
 
@@ -320,9 +320,7 @@ def move_soil(f, e, w):
             share = (r + rim) / r
             g[SPILLED] += drop_into_bed(n, load, share * w.tip[0], share * w.tip[1], falls)
         body = f.tip_body
-        compute_bucket_wrench(
-            out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6]
-        )
+        compute_bucket_wrench(out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6])
     g[SPILLED] += level_load(n, load)
     _push_from_the_side(f, e, w, theta, attitude)
     g[ENERGY] += f.period * supplied_power(f, e, w)
@@ -491,17 +489,18 @@ _CYCLE_TASK = Task(
     name="LoadTruck",
     kind="load",
     description=(
-        "An excavator digs soft, loamy or firm soil from a bank 0.5 to 1 m high, lifts it, swings by 70 to 110 deg,"
-        " dumps it into the bed of a truck with walls 1.9 m high, and returns, until 5 m3 of loose soil are in the"
-        " truck. `phase` makes an episode of a single phase: `dig`, `haul`, `dump` or `return`."
+        "An excavator fills a truck with soft, loamy or firm soil. It digs in a bank 0.5 to 1 m high, lifts the"
+        " bucket, swings by 70 to 110 deg, dumps into the bed with walls 1.9 m high, and returns. The truck is full"
+        " with 5 m3 of loose soil. `phase` makes an episode of a single phase: `dig`, `haul`, `dump` or `return`."
     ),
     reward=(
-        "The reward is 10 per m3 in the truck, minus 10 per m3 spilled, 1 per MJ of hydraulic energy, 0.1 per second"
-        " and 1 per 10 kN s of force on the truck. A potential is added whose sum over an episode depends only on"
-        " its ends: 10 per m3 in the bucket times a value that rises from 0.3 to 0.7 on the way to the truck, and"
-        " for an empty bucket -2 on the way from the bank. Success ends the episode with 10: `cycle` 5 m3 loaded,"
-        " `dig` 0.45 m3 lifted 0.3 m above the bank, `haul` the load above the bed, `dump` the bucket empty and 80 %"
-        " of it in the truck, `return` the edge above the bank. A force above 100 kN on the truck ends it with -20."
+        "The reward is 10 per m3 in the truck. Every m3 spilled costs 10, every MJ of hydraulic energy 1, every"
+        " second 0.1, and every 10 kN s of force on the truck 1. The change of a potential is added. A m3 in the"
+        " bucket has the potential 3, which rises to 7 above the truck; an empty bucket has -2 far from the bank"
+        " and 0 at it. Success ends the episode with 10. In `cycle` it is a full truck, in `dig` 0.45 m3 lifted 0.3"
+        " m above the bank. In `haul` it is the bucket above the bed with 80 % of its load, in `dump` an empty"
+        " bucket with 80 % of the load in the truck. In `return` it is the edge above the bank. A force above 100 kN"
+        " on the truck ends the episode with -20."
     ),
     machine="cat215",
     tool="bucket",

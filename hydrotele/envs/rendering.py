@@ -48,7 +48,7 @@ from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.soil.parameters import CAT215
 
 _BANK_COLOUR, _LOOSE_COLOUR = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
-_GROUND_COLOUR, _BANK_SIDE = (0.45, 0.40, 0.32, 1.0), 2.5  # of the ground beside a trench, m of it that are drawn
+_GROUND_COLOUR, _BANK_SIDE = (0.45, 0.40, 0.32, 1.0), 2.5  # of the ground next to a trench, m of it that are drawn
 _MIN_LOOSE_THICKNESS = 1e-3  # m, maximum thickness of loose soil that is not drawn
 
 
@@ -87,7 +87,7 @@ def make_soil_markers(core: TaskCore, number: int) -> list[Marker]:
 
 
 def _make_load_markers(core: TaskCore, number: int) -> list[Marker]:
-    """Return boxes for the bank, the undisturbed ground beside it, the soil in the bucket, and the load of the truck."""
+    """Return boxes for the bank, the undisturbed ground next to it, and the load of the truck."""
     terrain, goal = core.terrain[number], core.episodes["goal"][number]
     azimuth, half = float(goal[BANK_AZIMUTH]), 0.5 * CAT215.width
     turn = _rotation_about_z(azimuth)

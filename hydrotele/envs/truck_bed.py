@@ -111,8 +111,8 @@ def release_soil_in_air(n, state, attitude, period, out):
 def drop_into_bed(n, load, x, y, volume):
     """Add soil that falls from the bucket to the load of the bed.
 
-    The soil falls in a slab as wide as the interior of the bucket; the part of the slab that is
-    beside the bed is spilled.
+    The soil falls in a slab as wide as the interior of the bucket; the part of the slab outside
+    the bed is spilled.
 
     Args:
         n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.

@@ -47,10 +47,10 @@ of the ground above the plane in 20 equal sections from r = 3.8 to 5.8 m; negati
 Volumes are loose; `removed_volume` = `loaded_volume` + `carried_volume` + `spilled_volume` (at the start
 of `haul` and `dump` the bucket holds soil that was never in the bank). `energy` is the hydraulic energy that
 the valves have taken from the pump; `truck_force` is the largest sum of the normal forces on the truck within
-the step. The bank is a strip as wide as the bucket, at `bank_bearing` from the bucket's edge; beside it,
+the step. The bank is a strip as wide as the bucket, at `bank_bearing` from the bucket's edge. Next to it,
 the ground only resists a bucket that swings sideways through it. `bank_height.0` to `.19` are mean heights
-in 20 equal sections from r = 4.5 to 8.5 m, `load_height.0` to `.9` those of the load above the floor of the
-bed, from the tailgate on. Soil falls at once, and the load does not push on the bucket.
+in 20 equal sections from r = 4.5 to 8.5 m. `load_height.0` to `.9` are those of the load above the floor of
+the bed, from the tailgate on. Soil falls at once, and the load does not push on the bucket.
 [Results](validation/load_truck.md).""",
 }
 

@@ -107,7 +107,12 @@ def tip_poses(arm: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 class LoadTruckController:
-    """Controller that fills the truck by repeated cycles; it also completes the single phases of the task."""
+    """Controller that fills the truck by repeated cycles; it also completes the single phases of the task.
+
+    Attributes:
+        phase: (n,) READY (move to the bank), ENTER, DRAW, CURL (cut), HAUL or DUMP.
+        flow_demand: (n,) flow that the requested rates take, as a fraction of the flow that may be used [1].
+    """
 
     def __init__(self, setup: TaskSetup) -> None:
         """Find the observation columns that the controller uses, and read limits from `setup.machine`."""
@@ -116,8 +121,7 @@ class LoadTruckController:
         self._bank = find_observation_columns(setup, "bank_height", [str(p) for p in range(SECTION_COUNT)])
         self._load = find_observation_columns(setup, "load_height", [str(p) for p in range(LOAD_SECTION_COUNT)])
         self._mass, self._to_bank, self._to_truck = (
-            find_observation_columns(setup, name, [""])[0]
-            for name in ("carried_mass", "bank_bearing", "truck_bearing")
+            find_observation_columns(setup, name, [""])[0] for name in ("carried_mass", "bank_bearing", "truck_bearing")
         )
         self._follower, self._radii = JointFollower(setup), profile_section_radii()
         self._arm, _, self._ranges = arm_specification(setup.machine)
@@ -128,10 +132,11 @@ class LoadTruckController:
         self._flow = _PUMP_SHARE * machine.supply.pump_flow
         columns = [setup.variants.plant.axes.index(axis) for axis in setup.axes]
         self._moment_arms = setup.drive_table[columns, :, 0]
-        lowest = [machine.joints[machine.axes[axis].joint].range or (-np.pi, np.pi) for axis in setup.axes]
-        self._grid = np.array(lowest)
-        bed = np.hypot(*TRUCK.position) + TRUCK.length * ((np.arange(LOAD_SECTION_COUNT) + 0.5) / LOAD_SECTION_COUNT - 0.5)
-        self._bed_radii = bed
+        ranges = [machine.joints[machine.axes[axis].joint].range or (-np.pi, np.pi) for axis in setup.axes]
+        points = self._moment_arms.shape[1]
+        self._grids = [np.linspace(*limits, points) for limits in ranges]
+        place = (np.arange(LOAD_SECTION_COUNT) + 0.5) / LOAD_SECTION_COUNT - 0.5
+        self._bed_radii = np.hypot(*TRUCK.position) + TRUCK.length * place
 
     def begin(self, count: int) -> None:
         """Allocate the controller state for `count` parallel episodes."""
@@ -197,8 +202,7 @@ class LoadTruckController:
     def _plan_cut(self, bank: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radius (n,) at which a cut starts, and the height (n,) of its level bottom [m].
 
-        Of all cuts with the wanted area of soil above their bottom, the one with the highest bottom
-        is taken. `bank` (n, SECTION_COUNT) are the heights of the bank [m].
+        Every cut has the same area of soil above its bottom. The one with the highest bottom is taken. `bank` (n, SECTION_COUNT) are the heights of the bank [m].
         """
         before = _START_RADII[:, None] - self._radii
         inside = (before > _ENTRY_LENGTH) & (before < _CUT_LENGTH + 0.5 * _CURL_LENGTH)
@@ -233,7 +237,8 @@ class LoadTruckController:
         pose[:, R] = np.where(hauling, self._pin + carry, np.where(dumping, self._pin + reach, self._start))
         pose[:, THETA] = theta + np.where(hauling | dumping, seen[:, self._to_truck], seen[:, self._to_bank])
         high = RAIL_HEIGHT + _RAIL_CLEARANCE
-        pose[:, Z] = np.where(hauling, high + _BUCKET_DEPTH, np.where(dumping, high + _DUMP_RISE, above + _READY_HEIGHT))
+        lowered = np.where(dumping, high + _DUMP_RISE, above + _READY_HEIGHT)
+        pose[:, Z] = np.where(hauling, high + _BUCKET_DEPTH, lowered)
         entry = np.interp(self._start, *_ENTRY_ATTITUDES)
         pose[:, ATTITUDE] = np.where(hauling, _CARRY_ATTITUDE, np.where(dumping, _DUMP_ATTITUDE, entry))
         compute_joint_angles(self._arm, self._ranges, pose, q)
@@ -243,12 +248,13 @@ class LoadTruckController:
         """Return the joint rates (n, 4) towards the goal of a move [rad/s].
 
         A loaded bucket swings only above the bank, and to the truck only above its walls. An empty one
-        is lowered only beside the truck.
+        is lowered only after it has left the truck.
         """
         left = self._goal_joints(seen) - self._q
         hauling, to_truck = self.phase == HAUL, np.abs(seen[:, self._to_truck])
         lowest = tip[:, Z] - _BUCKET_DEPTH
-        in_bank = (np.abs(seen[:, self._to_bank]) < BANK_HALF_ANGLE) & (lowest < seen[:, self._bank].max(1) + _CLEARANCE)
+        in_bank = lowest < seen[:, self._bank].max(1) + _CLEARANCE
+        in_bank &= np.abs(seen[:, self._to_bank]) < BANK_HALF_ANGLE
         below_rail = lowest < RAIL_HEIGHT + _RAIL_CLEARANCE / 2.0
         swing = np.sign(left[:, 0]) * np.maximum(np.abs(left[:, 0]) - _ARRIVE_ANGLE, 0.0)
         left[:, 0] = np.where(hauling & in_bank, 0.0, np.where(hauling & below_rail, swing, left[:, 0]))
@@ -286,7 +292,7 @@ class LoadTruckController:
         return rate
 
     def _advance(self, wanted: np.ndarray, cutting: np.ndarray, joint: np.ndarray) -> None:
-        """Advance the joint references by one step with the wanted rates (n, 4), within all limits.
+        """Advance the joint references by one step with the requested rates (n, 4), within all limits.
 
         If the rates exceed the rate of a joint or the flow of the pump, all are reduced by the same
         factor. `cutting` (n,) is whether the reference follows the path of a cut, whose
@@ -294,10 +300,11 @@ class LoadTruckController:
         """
         flow = np.zeros(len(wanted))
         for a in range(wanted.shape[1]):
-            arm = np.interp(self._q[:, a], np.linspace(*self._grid[a], self._moment_arms.shape[1]), self._moment_arms[a])
+            arm = np.interp(self._q[:, a], self._grids[a], self._moment_arms[a])
             travel = arm * wanted[:, a]
             flow += np.where(travel > 0.0, self._areas[a, 0], self._areas[a, 1]) * np.abs(travel)
-        over = np.maximum(np.max(np.abs(wanted) / self._fastest, axis=1), flow / self._flow)
+        self.flow_demand = flow / self._flow
+        over = np.maximum(np.max(np.abs(wanted) / self._fastest, axis=1), self.flow_demand)
         wanted = wanted / np.maximum(over, 1.0)[:, None]
         change = np.where(cutting, 4.0, _ACCELERATION_SHARE * MAX_ACCELERATION)[:, None] * self._dt
         before = self._q.copy()
