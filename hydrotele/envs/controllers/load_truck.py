@@ -202,7 +202,8 @@ class LoadTruckController:
     def _plan_cut(self, bank: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the radius (n,) at which a cut starts, and the height (n,) of its level bottom [m].
 
-        Every cut has the same area of soil above its bottom. The one with the highest bottom is taken. `bank` (n, SECTION_COUNT) are the heights of the bank [m].
+        Every cut has the same area of soil above its bottom. The one with the highest bottom is taken.
+        `bank` (n, SECTION_COUNT) are the heights of the bank [m].
         """
         before = _START_RADII[:, None] - self._radii
         inside = (before > _ENTRY_LENGTH) & (before < _CUT_LENGTH + 0.5 * _CURL_LENGTH)
