@@ -35,7 +35,6 @@ TRUCK = DumpTruck(position=(0.0, 5.5), direction=math.pi / 2.0, wall_height=0.6)
 """The truck: a two-axle dump truck of 18 t, left of the machine, rear towards it. Its bed holds 5.5 m^3 struck."""
 LOAD_CELL_COUNT = 40
 LOAD_CELL_LENGTH = TRUCK.length / LOAD_CELL_COUNT  # m
-STRUCK_VOLUME = TRUCK.length * TRUCK.width * TRUCK.wall_height  # m^3
 RAIL_HEIGHT = TRUCK.floor_height + TRUCK.wall_height  # m, height over which the bucket is lifted
 _X, _Y = TRUCK.position
 _LENGTH, _WIDTH, _WALL = TRUCK.length, TRUCK.width, TRUCK.wall_height
