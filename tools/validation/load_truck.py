@@ -41,8 +41,8 @@ joint rates, sensors are ideal, and every episode has its own soil, bank and sta
 """
 CONCLUSION = """
 For a truck on the floor of the excavation next to the soil, the Caterpillar Performance Handbook
-([edition 47, page 7-246](https://cld.bz/bookdata/S232Z0r/basic-html/page-575.html)) calls cycles of 10 to 17 s practical; 15 to 20 s are
-typical. The cycles here are at the slow end of this range. The tables show what limits them:
+([edition 47, page 7-246](https://cld.bz/bookdata/S232Z0r/basic-html/page-575.html)) calls cycles of 10 to 17 s
+practical; 15 to 20 s are typical. The cycles here are at the slow end of this range. The tables show what limits them:
 
 - Swing: both swings cover 2 x 1.6 rad at 0.6 rad/s, the rate of the joint servo (0.8 of the valve's rated flow).
 - Pump: 300 L/min feed all four axes, so lifting and swinging slow each other down.
