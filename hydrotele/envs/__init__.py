@@ -18,7 +18,7 @@ PLUGIN_GROUP = "hydrotele.tasks"
 
 TASK_NAMES = (
     "TrackTrajectory", "StraightLine", "HoldForce", "ReachFeller", "Grade",
-    "PlaceLog",
+    "PlaceLog", "LoadTruck",
 )  # fmt: skip
 
 

@@ -163,6 +163,7 @@ TASK_PARAMETERS = np.dtype(
         ("at_eq_data", _I),
         ("at_stiffness", _I),
         ("at_damping", _I),
+        ("at_sensordata", _I),
     ],
     align=True,
 )

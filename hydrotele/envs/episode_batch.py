@@ -69,6 +69,7 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
     Raises:
         InputError: an option is not valid for the task.
     """
+    task = task.choose_phase(options.phase)
     options = dataclasses.replace(
         options, action=options.action or task.action,
         duration=task.duration if options.duration is None else options.duration,

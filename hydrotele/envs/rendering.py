@@ -20,10 +20,12 @@ from hydrotele.envs.episode import MAX_ARM_AXES
 from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.grade import MAX_RADIUS, MIN_RADIUS, target_plane_height
 from hydrotele.envs.hold_force import MEASURED_FORCE, reference_force
+from hydrotele.envs.load_truck import BANK_AZIMUTH, undisturbed_height
 from hydrotele.envs.place_log import GOAL_POSE, LOG_HALF_LENGTH, LOG_RADIUS
-from hydrotele.envs.soil_bed import CELL_COUNT, CELL_LENGTH, PROFILE_START
+from hydrotele.envs.soil_bed import CELL_COUNT, CELL_LENGTH, PROFILE_START, TERRAIN_SIZE
 from hydrotele.envs.straight_line import SETTLE_TIME, compute_line_pose
 from hydrotele.envs.track_trajectory import compute_axis_reference
+from hydrotele.envs.truck_bed import LOAD_CELL_COUNT, LOAD_CELL_LENGTH, TRUCK
 from hydrotele.kinematics.task_space import (
     BASE_RADIUS,
     BOOM_LENGTH,
@@ -46,6 +48,7 @@ from hydrotele.simulate.mechanism import compile_mechanism
 from hydrotele.soil.parameters import CAT215
 
 _BANK_COLOUR, _LOOSE_COLOUR = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
+_GROUND_COLOUR, _BANK_SIDE = (0.45, 0.40, 0.32, 1.0), 2.5  # of the ground next to a trench, m of it that are drawn
 _MIN_LOOSE_THICKNESS = 1e-3  # m, maximum thickness of loose soil that is not drawn
 
 
@@ -55,8 +58,7 @@ def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
     It follows from the true swing angle of the simulation `number`.
     """
     swing = float(core.episodes["position"][number][core.parameters["driven_axis"][0]])
-    c, s = math.cos(swing), math.sin(swing)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return _rotation_about_z(swing)
 
 
 def make_soil_markers(core: TaskCore, number: int) -> list[Marker]:
@@ -82,6 +84,45 @@ def make_soil_markers(core: TaskCore, number: int) -> list[Marker]:
     boxes = [make_cell_box(i, bottom, float(bank[i]), _BANK_COLOUR) for i in range(CELL_COUNT)]
     heaps = [i for i in range(CELL_COUNT) if loose[i] > _MIN_LOOSE_THICKNESS]
     return boxes + [make_cell_box(i, float(bank[i]), float(surface[i]), _LOOSE_COLOUR) for i in heaps]
+
+
+def _make_load_markers(core: TaskCore, number: int) -> list[Marker]:
+    """Return boxes for the bank, the undisturbed ground next to it, and the load of the truck."""
+    terrain, goal = core.terrain[number], core.episodes["goal"][number]
+    azimuth, half = float(goal[BANK_AZIMUTH]), 0.5 * CAT215.width
+    turn = _rotation_about_z(azimuth)
+    surface, loose = terrain[:CELL_COUNT], terrain[CELL_COUNT : 2 * CELL_COUNT]
+    markers = []
+
+    def add(r: float, side: float, width: float, low: float, high: float, colour) -> None:
+        middle = turn @ [r, side, 0.5 * (low + high)]
+        sizes = (0.5 * CELL_LENGTH, 0.5 * width, 0.5 * (high - low))
+        markers.append(make_box_marker(middle, sizes, colour, turn)._replace(emission=0.0))
+
+    bottom = float(surface.min()) - 0.1
+    for i in range(CELL_COUNT):
+        r = PROFILE_START + (i + 0.5) * CELL_LENGTH
+        add(r, 0.0, 2.0 * half, bottom, float(surface[i] - loose[i]), _BANK_COLOUR)
+        if loose[i] > _MIN_LOOSE_THICKNESS:
+            add(r, 0.0, 2.0 * half, float(surface[i] - loose[i]), float(surface[i]), _LOOSE_COLOUR)
+        high = float(undisturbed_height.py_func(goal, r))
+        if high > 0.0:
+            for side in (-1.0, 1.0):
+                add(r, side * (half + 0.5 * _BANK_SIDE), _BANK_SIDE, 0.0, high, _GROUND_COLOUR)
+    ahead = _rotation_about_z(TRUCK.direction)
+    for i, height in enumerate(terrain[TERRAIN_SIZE : TERRAIN_SIZE + LOAD_CELL_COUNT]):
+        if height > _MIN_LOOSE_THICKNESS:
+            place = ahead @ [(i + 0.5) * LOAD_CELL_LENGTH - 0.5 * TRUCK.length, 0.0, 0.5 * float(height)]
+            sizes = (0.5 * LOAD_CELL_LENGTH, 0.5 * TRUCK.width, 0.5 * float(height))
+            place += [*TRUCK.position, TRUCK.floor_height]
+            markers.append(make_box_marker(place, sizes, _LOOSE_COLOUR, ahead)._replace(emission=0.0))
+    return markers
+
+
+def _rotation_about_z(angle: float) -> np.ndarray:
+    """Return the rotation matrix (3, 3) about the vertical by an angle [rad]."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def make_target_plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
@@ -243,6 +284,7 @@ _MARKER_FUNCTIONS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
     "reach": _make_reach_markers,
     "grade": _make_grade_markers,
     "place": _make_place_markers,
+    "load": _make_load_markers,
 }
 
 

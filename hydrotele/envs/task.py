@@ -7,7 +7,7 @@ whether it stays in the workspace.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_specification
 from hydrotele.core.compiled import Callback, compiled
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES, arm_values
 from hydrotele.envs.observation import ObservationField, max_reach
@@ -62,6 +63,7 @@ class Task:
         with_readings: whether the observation starts with the readings of the machine.
         code: native code of a task outside this package, None for an entry of TASK_CODES.
         program: the task in plain Python that `code` does not compute, see `envs.python_task`; None without one.
+        phases: name -> the task for one phase only, for the option `phase`.
     """
 
     name: str
@@ -90,6 +92,20 @@ class Task:
     with_readings: bool = True
     code: Callback | None = None
     program: Any = None
+    phases: Mapping[str, "Task"] = dataclasses.field(default_factory=dict)
+
+    def choose_phase(self, phase: str | None) -> "Task":
+        """Return the task for one of its phases, or the task itself for None.
+
+        Raises:
+            InputError: the task has no such phase.
+        """
+        if phase is None:
+            return self
+        if phase not in self.phases:
+            known = suggest_valid_name(phase, self.phases) if self.phases else f"{self.name} has no phases"
+            raise InputError(f"phase {phase!r}", known)
+        return self.phases[phase]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +130,8 @@ class Options:
         timestep: physics step [s].
         servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
             `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
+        phase: phase of the task that an episode consists of, for a curriculum; only for tasks with phases
+            (`LoadTruck`: `dig`, `haul`, `dump`, `return`, `cycle`).
     """
 
     machine: str | Path | Machine | None = None
@@ -128,6 +146,7 @@ class Options:
     variant_seed: int = 0
     timestep: float = 1.0e-3
     servo: dict[str, Any] = dataclasses.field(default_factory=dict)
+    phase: str | None = None
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)

@@ -14,6 +14,7 @@ from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode_batch import TaskCore
 from hydrotele.envs.grade import GRADE
 from hydrotele.envs.hold_force import HOLD_FORCE
+from hydrotele.envs.load_truck import LOAD_TRUCK
 from hydrotele.envs.place_log import PLACE_LOG
 from hydrotele.envs.python_task import PythonTaskCore, find_python_task
 from hydrotele.envs.reach_feller import REACH_FELLER
@@ -30,6 +31,7 @@ TASKS = {
         REACH_FELLER,
         GRADE,
         PLACE_LOG,
+        LOAD_TRUCK,
     )
 }
 """Tasks by name."""

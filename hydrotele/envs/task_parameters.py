@@ -11,7 +11,7 @@ from hydrotele.control.servo import servo_parameters, tabulate_drive_geometry
 from hydrotele.core.compiled import Callback
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.envs import grade, hold_force, place_log, reach_feller, straight_line, track_trajectory
+from hydrotele.envs import grade, hold_force, load_truck, place_log, reach_feller, straight_line, track_trajectory
 from hydrotele.envs.episode import ACTIONS, TASK_PARAMETERS, VALVE
 from hydrotele.envs.task import REAL_SENSORS
 from hydrotele.envs.task_setup import MAX_ACCELERATION, MAX_POSE_ACCELERATIONS, TaskSetup, full_action_rate
@@ -25,6 +25,7 @@ from hydrotele.simulate.sensor_models import periods_per_sample
 TASK_CODES: dict[str, Callback] = {
     "track": track_trajectory.run_task_part, "line": straight_line.run_task_part, "force": hold_force.run_task_part,
     "reach": reach_feller.run_task_part, "grade": grade.run_task_part, "place": place_log.run_task_part,
+    "load": load_truck.run_task_part,
 }  # fmt: skip
 """Kind of task -> its native code, see `task_interface.TASK_SIGNATURE`."""
 
@@ -136,7 +137,7 @@ def _write_memory_layout(facts: np.ndarray) -> None:
         ("at_qpos", "qpos"), ("at_qvel", "qvel"), ("at_act", "act"), ("at_ctrl", "ctrl"),
         ("at_site", "site_xpos"), ("at_xfrc", "xfrc_applied"), ("at_xpos", "xpos"),
         ("at_xipos", "xipos"), ("at_xquat", "xquat"), ("at_xmat", "xmat"),
-        ("at_warning", "warning"), ("at_eq_active", "eq_active"),
+        ("at_warning", "warning"), ("at_eq_active", "eq_active"), ("at_sensordata", "sensordata"),
     ):  # fmt: skip
         facts[name] = data[member]
     for name, member in (

@@ -1,4 +1,4 @@
-"""Specification of the objects around a machine: plate, standing tree, log on the ground, and soil."""
+"""Specification of the objects around a machine: plate, standing tree, log on the ground, soil, and truck."""
 
 import math
 from typing import Annotated, Literal
@@ -105,7 +105,25 @@ class SoilGround(StrictModel):
     soil: Literal["soft", "sandy_loam", "firm"] = "sandy_loam"
 
 
-SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround, Field(discriminator="kind")]
+class DumpTruck(StrictModel):
+    """A standing two-axle dump truck with a rigid open bed, against which the tool can strike.
+
+    `position` [m] is the point (x, y) under the centre of the bed, and `direction` [rad] the angle of
+    the truck's forward axis in the horizontal plane, 0 along x. `length` and `width` are inner
+    dimensions of the bed, `floor_height` is the height of its floor above ground and `wall_height` that of its
+    walls above the floor [m].
+    """
+
+    kind: Literal["truck"] = "truck"
+    position: tuple[float, float]
+    direction: float = 0.0
+    length: PositiveFloat = 4.0
+    width: PositiveFloat = 2.3
+    floor_height: PositiveFloat = 1.3
+    wall_height: PositiveFloat = 0.7
+
+
+SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround | DumpTruck, Field(discriminator="kind")]
 
 
 def read_soil_from_log(log: Log) -> tuple[SoilGround, ...]:

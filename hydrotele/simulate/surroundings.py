@@ -1,7 +1,8 @@
-"""Objects around a machine in MuJoCo: plates, logs, soil and trees.
+"""Objects around a machine in MuJoCo: plates, logs, soil, trees and trucks.
 
 Plates are mounted on springs. Trees stand on stiff springs; a spinning saw cuts them with a cutting
 torque and a feed force. Logs, and trees once they are held, have contact with the ground only.
+A truck is rigid; a touch sensor measures the sum of the normal forces on it.
 """
 
 import math
@@ -12,7 +13,14 @@ import numpy as np
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.surrounding_objects import LogOnGround, Plate, SoilGround, StandingTree, SurroundingObject
+from hydrotele.scenario.surrounding_objects import (
+    DumpTruck,
+    LogOnGround,
+    Plate,
+    SoilGround,
+    StandingTree,
+    SurroundingObject,
+)
 from hydrotele.simulate.gripping import RELEASED, TAKEN, grip_parameters, grip_step, timber_log_grip_parameters
 from hydrotele.simulate.soil_bed import BedInSimulation, SoilBed, machine_bucket
 
@@ -28,17 +36,18 @@ _STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head,
 _MAX_STEM_ANGLE = math.acos(0.9)  # rad: largest angle between stem and head
 _LOG_DAMPING = 30.0  # N s/m and N m s/rad: soil damping; a rolling log stops within half a second
 _LOG_PENETRATION = 1.0e-5  # m: static penetration of a log into the soft contact of the ground
-_PREFIXES = ("plate_", "tree_", "log_")
+_PREFIXES = ("plate_", "tree_", "log_", "truck_")
+_WALL = 0.05  # m, half thickness of floor and walls of a truck's bed
 
 
 def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject, ...], visuals: bool = True) -> None:
-    """Add plates, trees and logs to an assembled MJCF; soil replaces the contact of bucket and ground.
+    """Add plates, trees, logs and trucks to an assembled MJCF; soil replaces the contact of bucket and ground.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
-        objects: plates, trees, logs and soil.
-        visuals: whether to add the visual geometry of logs.
+        objects: plates, trees, logs, soil and trucks.
+        visuals: whether to add the visual geometry of logs and trucks.
 
     Raises:
         InputError: the machine does not have the given saw or grab, or the grab has no pocket for
@@ -54,6 +63,8 @@ def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject,
             machine_bucket(machine)
             assert machine.arm  # it has a bucket
             root.contact.add("exclude", name=f"soil_{number}", body1="world", body2=machine.arm.tip.link)
+        elif isinstance(thing, DumpTruck):
+            _write_truck(root, f"truck_{number}", thing, visuals)
         else:
             body = _add_timber_log(root, f"log_{number}", thing, machine, where)
             if visuals:
@@ -77,6 +88,40 @@ def _write_plate(root, name: str, plate: Plate) -> None:
         "geom", name=name, type="box", size=sides, contype=1, conaffinity=2, mass=0,
         solref=_PLATE_SOLREF, priority=2, rgba=(0.42, 0.44, 0.47, 1),
     )  # fmt: skip
+
+
+def _write_truck(root, name: str, truck: DumpTruck, visuals: bool) -> None:
+    """Add a rigid truck and its touch sensor to the MJCF: bed, cab, and with `visuals` chassis and wheels."""
+    turn = (math.cos(truck.direction / 2.0), 0.0, 0.0, math.sin(truck.direction / 2.0))
+    body = root.worldbody.add("body", name=name, pos=(*truck.position, 0.0), quat=turn)
+    half, side, floor, wall = 0.5 * truck.length, 0.5 * truck.width, truck.floor_height, 0.5 * truck.wall_height
+    paint, steel, dark = (0.16, 0.30, 0.48, 1), (0.33, 0.35, 0.38, 1), (0.10, 0.10, 0.11, 1)
+    cab_back = half + 2.0 * _WALL + 0.25
+    boxes = {
+        "floor": ((0.0, 0.0, floor - _WALL), (half, side, _WALL), steel),
+        "tailgate": ((-half - _WALL, 0.0, floor + wall), (_WALL, side + 2.0 * _WALL, wall), steel),
+        "front": ((half + _WALL, 0.0, floor + wall + 0.1), (_WALL, side + 2.0 * _WALL, wall + 0.1), steel),
+        "left": ((0.0, side + _WALL, floor + wall), (half, _WALL, wall), steel),
+        "right": ((0.0, -side - _WALL, floor + wall), (half, _WALL, wall), steel),
+        "cab": ((cab_back + 0.8, 0.0, 1.8), (0.8, side, 0.95), paint),
+    }
+    for part, (place, size, colour) in boxes.items():
+        body.add(
+            "geom", name=f"{name}_{part}", type="box", pos=place, size=size, rgba=colour, mass=0,
+            contype=1, conaffinity=2,
+        )  # fmt: skip
+    body.add("site", name=name, type="box", pos=(0.0, 0.0, 5.0), size=(20.0, 20.0, 10.0), group=4)
+    root.sensor.add("touch", name=name, site=name)
+    if not visuals:
+        return
+    looks = {"mass": 0, "contype": 0, "conaffinity": 0, "group": 2}
+    body.add("geom", type="box", pos=(0.9, 0.0, 0.95), size=(half + 1.1, 0.42, 0.14), rgba=dark, **looks)
+    body.add("geom", type="box", pos=(cab_back + 1.61, 0.0, 2.2), size=(0.01, side - 0.15, 0.4), rgba=dark, **looks)
+    for x in (-0.5 * half, cab_back + 0.7):
+        for y in (side - 0.15, 0.15 - side):
+            body.add(
+                "geom", type="cylinder", size=(0.5,), fromto=(x, y - 0.15, 0.5, x, y + 0.15, 0.5), rgba=dark, **looks
+            )  # fmt: skip
 
 
 def _check_axis(machine: Machine, axis: str, where: str) -> None:
@@ -186,7 +231,7 @@ def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def is_surrounding_object(name: str) -> bool:
-    """Return whether a body or joint of this name belongs to a plate, tree or log."""
+    """Return whether a body or joint of this name belongs to a plate, tree, log or truck."""
     return name.startswith(_PREFIXES)
 
 

@@ -44,6 +44,15 @@ the plate is pressed down. The reward uses the true force.""",
     "Grade": """\
 `soil` is 0 for soft, 1 for loamy, 2 for firm soil. `profile_error.0` to `.19` are the mean heights
 of the ground above the plane in 20 equal sections from r = 3.8 to 5.8 m; negative: too low.""",
+    "LoadTruck": """\
+Volumes are loose; `removed_volume` = `loaded_volume` + `carried_volume` + `spilled_volume` (at the start
+of `haul` and `dump` the bucket holds soil that was never in the bank). `energy` is the hydraulic energy that
+the valves have taken from the pump; `truck_force` is the largest sum of the normal forces on the truck within
+the step. The bank is a strip as wide as the bucket, at `bank_bearing` from the bucket's edge. Next to it,
+the ground only resists a bucket that swings sideways through it. `bank_height.0` to `.19` are mean heights
+in 20 equal sections from r = 4.5 to 8.5 m. `load_height.0` to `.9` are those of the load above the floor of
+the bed, from the tailgate on. Soil falls at once, and the load does not push on the bucket.
+[Results](validation/load_truck.md).""",
 }
 
 

@@ -6,6 +6,7 @@ from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller, RandomController, ZeroController
 from hydrotele.envs.controllers.grade import make_grade_controller
+from hydrotele.envs.controllers.load_truck import make_load_controller
 from hydrotele.envs.controllers.place_log import make_place_controller
 from hydrotele.envs.controllers.tracking import (
     make_line_controller,
@@ -22,6 +23,7 @@ REFERENCE_CONTROLLERS: dict[str, Callable[[TaskSetup], Controller]] = {
     "HoldForce": make_press_controller,
     "ReachFeller": make_reach_controller,
     "PlaceLog": make_place_controller,
+    "LoadTruck": make_load_controller,
 }
 """Task name -> function that makes its reference controller for the chosen kind of actions."""
 
