@@ -39,6 +39,7 @@ MAX_VARIANTS = 10_000
 """Largest number of variants; each takes some milliseconds to prepare."""
 MAX_THREADS = 1024
 """Largest number of threads that step the episodes."""
+_MIN_DIFFICULTY = 0.01  # smallest size of the goals: the rates of a reference of size 0 would be 0 / 0
 
 
 def check_count(name: str, count: int, least: int, most: int) -> None:
@@ -70,6 +71,9 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
         duration=task.duration if options.duration is None else options.duration,
     )  # fmt: skip
     check_count("variants", options.variants, 1, MAX_VARIANTS)
+    for name, low in (("shaping", 0.0), ("difficulty", _MIN_DIFFICULTY)):
+        if not low <= (value := getattr(options, name)) <= 1.0:
+            raise InputError(name, f"must be from {low:g} to 1, not {value:g}")
     machine, clock = load_machine(task.machine, task.tool), make_timing(options)
     arm = arm_axes(machine)
     axes = (*arm, *task.extra_axes)

@@ -15,6 +15,7 @@ from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TASK_SIGNATURE,
     episode_states_view,
@@ -84,7 +85,7 @@ def draw_reach_goal(f, e):
     """
     g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
     compute_tip_pose(f.arm, arm_values(f, e.position), start)
-    size = 1.0
+    size = f.difficulty
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
             size *= _SHRINK_FACTOR  # the start is inside the workspace, so a close pose is reachable
@@ -197,6 +198,16 @@ def compute_reach_reward(f, e, w):
     return reward + (SUCCESS_REWARD if done else 0.0), done
 
 
+@compiled
+def compute_reach_potential(f, e):
+    """Return the potential of the true pose: minus the success reward for every metre or radian of error, scalar.
+
+    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE.
+    """
+    distance, angle = _compute_true_pose_errors(f, e)
+    return -SUCCESS_REWARD * combine_pose_errors(distance, angle)
+
+
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Return random start positions, arm axis -> [rad], with the head in the air before the machine, about level."""
     return sample_start_positions(
@@ -230,9 +241,9 @@ def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `ReachFeller` for the simulation `number`, in native code.
 
     `part` is BEGIN (draw the goal pose of a new episode), TICK (do nothing), OBSERVE (write
-    the task's values to the observation, from the address `out` on) or REWARD (return the reward
-    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
-    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
+    the task's values to the observation, from the address `out` on), REWARD (return the reward
+    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument` are the addresses of mjModel,
+    mjData and TASK_PARAMETERS. The result is 0 for the others; see
     `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
@@ -243,4 +254,6 @@ def run_task_part(part, m, d, number, argument, out):
         write_reach_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
         return store_episode_end(e, compute_reach_reward(f, e, w))
+    elif part == POTENTIAL:
+        return compute_reach_potential(f, e)
     return 0.0

@@ -97,6 +97,11 @@ class Options:
         variants: number of random machines and starts; every episode uses one of them.
         variant_seed: seed for drawing the variants.
         timestep: physics step [s].
+        shaping: discount factor gamma of the learner, at most 1; the reward of every step from state s to s'
+            then has the term gamma Phi(s') - Phi(s) in addition, with the task's potential Phi. It does
+            not change which policies are optimal for this gamma. 0 for the reward without it.
+        difficulty: size of the goals, at most 1 (those of the task): rates of references, length and speed
+            of lines, distance of poses; for a curriculum.
     """
 
     action: ActionKind | None = None
@@ -108,6 +113,8 @@ class Options:
     variants: int = 64
     variant_seed: int = 0
     timestep: float = 1.0e-3
+    shaping: float = 0.0
+    difficulty: float = 1.0
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
@@ -208,6 +215,26 @@ def compute_measured_pose(f, e, pose):
     Source: `kinematics.task_space.compute_tip_pose`.
     """
     compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
+
+
+RECOVERY_SPEED = 0.5  # m/s, speed at which a tracking error is assumed to decrease
+MAX_STEP_LOSS = 2.0  # difference of the largest and the smallest reward of a step in a tracking task
+
+
+@compiled
+def compute_recovery_potential(f, error):
+    """Return the potential of a tracking error: minus the reward that is lost until it is removed.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        error: position error, scalar [m]; 1 rad counts as 1 m.
+
+    Returns:
+        The potential, scalar: -2 for every environment step that the error takes at 0.5 m/s.
+
+    Source: the range of the rewards of `TrackTrajectory` and `StraightLine`.
+    """
+    return -MAX_STEP_LOSS * error / (RECOVERY_SPEED * f.ticks * f.period)
 
 
 @compiled
