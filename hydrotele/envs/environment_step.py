@@ -274,7 +274,7 @@ def _compute_potential(f, w):
 
 @compiled
 def _shape_reward(f, e, reward, potential):
-    """Add the potential-based shaping F = gamma Phi(s') - Phi(s) to the reward of a step from s to s', and store Phi(s').
+    """Add the potential-based shaping F = gamma Phi(s') - Phi(s) to the reward of a step from s to s'; store Phi(s').
 
     Source: Ng, Harada, Russell 1999, Policy invariance under reward transformations, theorem 1. Phi
     is 0 in a terminal state.

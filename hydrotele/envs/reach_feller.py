@@ -242,9 +242,9 @@ def run_task_part(part, m, d, number, argument, out):
 
     `part` is BEGIN (draw the goal pose of a new episode), TICK (do nothing), OBSERVE (write
     the task's values to the observation, from the address `out` on), REWARD (return the reward
-    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument` are the addresses of mjModel,
-    mjData and TASK_PARAMETERS. The result is 0 for the others; see
-    `task_interface.TASK_SIGNATURE`.
+    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument`
+    are the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 for the other parts;
+    see `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)

@@ -25,9 +25,10 @@ observation of the task, compute the reward of a step, compute the potential of 
 TASK_SIGNATURE = types.float64(*(types.int64,) * 6)
 """Signature of the native code of a task: (part, m, d, number, argument, out) -> reward or potential, otherwise 0.
 
-`part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation), REWARD
-or POTENTIAL (0 if the task has none; only called with shaping). `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
-mjModel, mjData, TASK_PARAMETERS and the observation (float32)."""
+`part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation),
+REWARD or POTENTIAL (only with shaping; 0 if the task has no potential). `number` is the index of the
+simulation; `m`, `d`, `argument` and `out` are the addresses of mjModel, mjData, TASK_PARAMETERS and
+the observation (float32)."""
 
 
 class SimulationView(NamedTuple):
