@@ -11,6 +11,7 @@ import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.control.servo import tabulate_drive_geometry
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode import (
@@ -77,6 +78,9 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
     machine, clock = load_machine(task.machine, task.tool), make_timing(options)
     arm = arm_axes(machine)
     axes = (*arm, *task.extra_axes)
+    for name in options.start or {}:
+        if name not in axes:
+            raise InputError(f"start.{name}", suggest_valid_name(name, axes))
     variants = make_variants(task, options, machine)
     fields = [*list_machine_observation_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
     table = tabulate_drive_geometry(machine, variants.plant.axes)[1]

@@ -53,10 +53,10 @@ class TrainingPlan:
     threads: int = 0
     shaping: bool = True
     curriculum: bool = True
-    gamma: float = 0.97
+    gamma: float = 0.98
     rollout_steps: int = 64
-    batch: int = 1024
-    epochs: int = 5
+    batch: int = 256
+    epochs: int = 10
     width: int = 64
     first_log_std: float = -0.5
 

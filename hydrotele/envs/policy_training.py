@@ -38,7 +38,7 @@ _Algorithm: Any = PPO or object
 StageReport = Callable[[str, float], None]
 
 _FEATURE_LIMIT = 10.0  # largest normalised input of the network
-_LEARNING_RATE, _MIN_RATE_FRACTION = 3.0e-4, 0.05  # step size at the start, and its fraction at the end
+_LEARNING_RATE, _MIN_RATE_FRACTION = 1.0e-3, 0.05  # step size at the start, and its fraction at the end
 _EVALUATIONS = 6  # evaluations of the policy during training
 _CURVE_EPISODES, _CURVE_SEED = 16, 2 * 10**6  # episodes of such an evaluation, seed of the first one
 _WARM_UP_STEPS = 50  # steps with random actions that give the first normalisation
@@ -252,3 +252,23 @@ def _make_model(plan: TrainingPlan, plain: StableVecEnv, env: Any) -> Any:
         seen.append(plain.step(rng.uniform(-1.0, 1.0, shape).astype(np.float32))[0])
     model.policy.features_extractor.update_statistics(np.array(seen))
     return model
+
+
+def load_policy(path: Path) -> PolicyController:
+    """Read a policy of `train_policy`, or any PPO policy of stable-baselines3 whose input is the observation.
+
+    Args:
+        path: file of the policy (.zip).
+
+    Returns:
+        The policy as a controller.
+
+    Raises:
+        InputError: stable-baselines3 is not installed, or the file is missing or is no such policy.
+    """
+    if torch is None:
+        raise InputError(path, "needs stable-baselines3: pip install 'hydrotele[learn]'")
+    try:
+        return PolicyController(_ScheduledPPO.load(path, device="cpu"))
+    except (OSError, ValueError, KeyError, AttributeError) as error:
+        raise InputError(path, f"is not a policy of stable-baselines3: {error}") from None

@@ -11,7 +11,14 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_pose_observation_fields, max_reach
-from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
+from hydrotele.envs.task import (
+    Task,
+    compute_measured_pose,
+    compute_path_effort,
+    count_recovery_steps,
+    sample_start_positions,
+    wrap_angle,
+)
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
@@ -200,12 +207,21 @@ def compute_reach_reward(f, e, w):
 
 @compiled
 def compute_reach_potential(f, e):
-    """Return the potential of the true pose: minus the success reward for every metre or radian of error, scalar.
+    """Return the potential of the true pose: the success reward, discounted until all errors have vanished.
 
-    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE.
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
+
+    Returns:
+        The potential, scalar: 10 gamma^n, where the sum of position, attitude and head error vanishes in n steps.
+
+    Source: `count_recovery_steps`.
     """
-    distance, angle = _compute_true_pose_errors(f, e)
-    return -SUCCESS_REWARD * combine_pose_errors(distance, angle)
+    arm, target = arm_values(f, e.position), e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
+    distance, _ = _compute_true_pose_errors(f, e)
+    angles = abs(wrap_angle(arm[1] + arm[2] + arm[3] - target[3])) + abs(arm[4] - target[4])
+    return SUCCESS_REWARD * f.shaping ** count_recovery_steps(f, combine_pose_errors(distance, angles))
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:

@@ -16,7 +16,7 @@ from hydrotele.envs.task import (
     Task,
     compute_measured_pose,
     compute_path_effort,
-    compute_recovery_potential,
+    compute_tracking_potential,
     sample_start_positions,
     wrap_angle,
 )
@@ -356,5 +356,5 @@ def run_task_part(part, m, d, number, argument, out):
         return store_episode_end(e, compute_line_reward(f, e, w))
     elif part == POTENTIAL:
         across, along, attitude = compute_true_line_errors(f, e)
-        return compute_recovery_potential(f, across + abs(along) + abs(attitude))
+        return compute_tracking_potential(f, across + abs(along) + abs(attitude))
     return 0.0

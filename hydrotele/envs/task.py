@@ -102,6 +102,7 @@ class Options:
             not change which policies are optimal for this gamma. 0 for the reward without it.
         difficulty: size of the goals, at most 1 (those of the task): rates of references, length and speed
             of lines, distance of poses; for a curriculum.
+        start: positions of axes at the start of every episode [rad] or [m]; those of other axes are drawn.
     """
 
     action: ActionKind | None = None
@@ -115,6 +116,7 @@ class Options:
     timestep: float = 1.0e-3
     shaping: float = 0.0
     difficulty: float = 1.0
+    start: dict[str, float] | None = None
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
@@ -217,24 +219,36 @@ def compute_measured_pose(f, e, pose):
     compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
 
 
-RECOVERY_SPEED = 0.5  # m/s, speed at which a tracking error is assumed to decrease
+RECOVERY_SPEED = 0.5  # m/s, speed at which potentials assume that an error decreases
 MAX_STEP_LOSS = 2.0  # difference of the largest and the smallest reward of a step in a tracking task
 
 
 @compiled
-def compute_recovery_potential(f, error):
-    """Return the potential of a tracking error: minus the reward that is lost until it is removed.
+def count_recovery_steps(f, error):
+    """Return the environment steps, scalar, in which an error [m] vanishes at RECOVERY_SPEED; 1 rad counts as 1 m.
+
+    `f` is the record of TASK_PARAMETERS.
+    """
+    return error / (RECOVERY_SPEED * f.ticks * f.period)
+
+
+@compiled
+def compute_tracking_potential(f, error):
+    """Return the potential of a tracking error: minus the discounted reward that is lost until it has vanished.
 
     Args:
         f: record of TASK_PARAMETERS.
         error: position error, scalar [m]; 1 rad counts as 1 m.
 
     Returns:
-        The potential, scalar: -2 for every environment step that the error takes at 0.5 m/s.
+        The potential, scalar: -2 (1 - gamma^n) / (1 - gamma) for n steps until the error has vanished.
 
-    Source: the range of the rewards of `TrackTrajectory` and `StraightLine`.
+    Source: sum of a geometric series; rewards of `TrackTrajectory` and `StraightLine`.
     """
-    return -MAX_STEP_LOSS * error / (RECOVERY_SPEED * f.ticks * f.period)
+    steps = count_recovery_steps(f, error)
+    if f.shaping >= 1.0:
+        return -MAX_STEP_LOSS * steps
+    return -MAX_STEP_LOSS * (1.0 - f.shaping**steps) / (1.0 - f.shaping)
 
 
 @compiled

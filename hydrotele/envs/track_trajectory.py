@@ -12,7 +12,7 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, MAX_AXES, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_position_observation_field, make_rate_observation_field
-from hydrotele.envs.task import Task, compute_recovery_potential
+from hydrotele.envs.task import Task, compute_tracking_potential
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
@@ -211,7 +211,7 @@ def run_task_part(part, m, d, number, argument, out):
     elif part == REWARD:
         return store_episode_end(e, compute_track_reward(f, e, w))
     elif part == POTENTIAL:
-        return compute_recovery_potential(f, compute_track_error(f, e))
+        return compute_tracking_potential(f, compute_track_error(f, e))
     return 0.0
 
 

@@ -83,7 +83,7 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     ranges, folder = split_randomise(options)
     written = folder and [file.stat().st_mtime_ns for file in sorted(folder.glob("posterior*")) if file.is_file()]
     key = repr((task.name, options.effects, ranges, folder and resolve_path(folder), written, options.variants,
-                options.variant_seed, options.timestep))  # fmt: skip
+                options.variant_seed, options.timestep, options.start))  # fmt: skip
     if key not in _CACHE:
         _CACHE[key] = _build_variants(task, options, nominal, ranges, _choose_machine(options, folder, nominal))
         while len(_CACHE) > _MAX_CACHED_SETS:
@@ -130,7 +130,7 @@ def _build_variants(
     machines, plants, states, tips = [], [], [], []
     for number in range(options.variants):
         rng = np.random.default_rng([options.variant_seed, number])
-        joints = task.start(nominal, rng)
+        joints = {**task.start(nominal, rng), **(options.start or {})}
         things = task.surroundings(nominal, rng, joints)
         machine = _apply_effects(choose_machine(number), options.effects, ranges, rng)
         known = (p for m, p in zip(machines, plants, strict=True)
