@@ -38,6 +38,7 @@ class TrainingPlan:
         curriculum: whether the goals grow from 0.2 of their size to the full size.
         gamma: discount factor of an environment step.
         rollout_steps: steps of every environment between two updates of the policy.
+        timestep: physics step of the training [s]; the policy is evaluated with that of the task.
         batch: samples of a gradient step.
         epochs: passes through the samples in an update.
         width: width of the two hidden layers.
@@ -54,8 +55,9 @@ class TrainingPlan:
     shaping: bool = True
     curriculum: bool = True
     gamma: float = 0.98
+    timestep: float = 2.5e-3
     rollout_steps: int = 64
-    batch: int = 256
+    batch: int = 512
     epochs: int = 10
     width: int = 64
     first_log_std: float = -0.5
