@@ -65,7 +65,7 @@ class TrainingPlan:
 
 @dataclasses.dataclass
 class TrainingState:
-    """Progress of a training, saved beside the policy.
+    """Progress of a training, saved in the folder of the policy.
 
     Attributes:
         plan: the plan.

@@ -49,7 +49,7 @@ def ignore_report(text: str, fraction: float) -> None:
     """Do nothing."""
 
 
-def never() -> bool:
+def return_false() -> bool:
     """Return False."""
     return False
 
@@ -58,7 +58,7 @@ class NormalisingExtractor(_Extractor):
     """First layer of a policy: append the reference errors to the observation and normalise both.
 
     A network hardly resolves millimetres in the difference of two positions that vary by metres, so
-    the errors (reference minus measured value) are inputs of their own. Mean and variance are part of the
+    the errors (reference minus measured value) are additional inputs. Mean and variance are part of the
     policy and are saved with it.
     """
 
@@ -191,7 +191,7 @@ class _Supervisor(_Callback):
 
 
 def train_policy(
-    state: TrainingState, folder: Path, report: StageReport = ignore_report, is_stopped: Callable[[], bool] = never
+    state: TrainingState, folder: Path, report: StageReport = ignore_report, is_stopped: Callable[[], bool] = return_false
 ) -> Any:
     """Train a policy, or continue its training, and write it with its learning curve into a folder.
 

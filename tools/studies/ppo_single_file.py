@@ -1,7 +1,8 @@
 """Train a policy with PPO in a single file, in the style of CleanRL: torch and `gymnasium.make_vec` only.
 
-The batch of environments is one object that native code steps; an episode that ends is followed by
-the next in the same step (`SameStep`). Observations and rewards are normalised by gymnasium's wrappers.
+The batch of environments is one object that native code steps. Observations and rewards are normalised by
+gymnasium's wrappers. After an episode has ended, the next step only resets its environment (`NextStep`,
+the default of gymnasium): this step is not learned from.
 """
 
 import argparse
@@ -24,8 +25,7 @@ GAMMA, LAMBDA, CLIP, EPOCHS, BATCHES, RATE = 0.98, 0.9, 0.2, 10, 16, 1e-3
 
 torch.manual_seed(asked.seed)
 torch.set_num_threads(1)
-envs = gymnasium.make_vec(asked.task, asked.envs, "vector_entry_point", autoreset_mode="SameStep",
-                          control_rate=25.0, shaping=GAMMA)  # fmt: skip
+envs = gymnasium.make_vec(asked.task, asked.envs, "vector_entry_point", control_rate=25.0, shaping=GAMMA)
 envs = NormalizeReward(NormalizeObservation(envs), gamma=GAMMA)
 size, actions = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
 
@@ -50,6 +50,7 @@ def as_tensor(values) -> torch.Tensor:
 
 
 observation, _ = envs.reset(seed=asked.seed)
+is_reset = np.zeros(asked.envs, bool)  # whether the next step resets an environment
 for update in range(max(1, asked.steps // (asked.envs * asked.rollout))):
     rows: list[tuple[torch.Tensor, ...]] = []
     for _ in range(asked.rollout):
@@ -58,17 +59,21 @@ for update in range(max(1, asked.steps // (asked.envs * asked.rollout))):
             action = make_distribution(seen).sample()
             chance, value = make_distribution(seen).log_prob(action), critic(seen)[:, 0]
         observation, reward, terminated, truncated, _ = envs.step(action.clamp(-1.0, 1.0).numpy())
-        rows.append((seen, action, chance, value, as_tensor(reward), as_tensor(terminated | truncated)))
+        columns = reward, terminated, terminated | truncated, ~is_reset
+        rows.append((seen, action, chance, value, *map(as_tensor, columns)))
+        is_reset = terminated | truncated
     with torch.no_grad():
         next_value = critic(as_tensor(observation))[:, 0]
-    seen, action, chance, value, reward, over = (torch.stack(column) for column in zip(*rows, strict=True))
+    stacked = [torch.stack(column) for column in zip(*rows, strict=True)]
+    seen, action, chance, value, reward, terminated, over, valid = stacked
     advantage, last = torch.zeros_like(reward), torch.zeros(asked.envs)
     for step in reversed(range(asked.rollout)):
-        difference = reward[step] + GAMMA * next_value * (1.0 - over[step]) - value[step]
+        difference = reward[step] + GAMMA * next_value * (1.0 - terminated[step]) - value[step]
         advantage[step] = last = difference + GAMMA * LAMBDA * (1.0 - over[step]) * last
         next_value = value[step]
-    seen, action, chance = seen.flatten(0, 1), action.flatten(0, 1), chance.flatten()
-    goal, advantage = (advantage + value).flatten(), advantage.flatten()
+    rows_used = valid.bool()
+    seen, action, chance = seen[rows_used], action[rows_used], chance[rows_used]
+    goal, advantage = (advantage + value)[rows_used], advantage[rows_used]
     for _ in range(EPOCHS):
         for chosen in torch.randperm(len(seen)).chunk(BATCHES):
             gain = advantage[chosen]
