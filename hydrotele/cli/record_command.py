@@ -32,7 +32,7 @@ def record_dataset(options: RecordOptions) -> None:
         InputError: the task, an option, the policy or a log is not valid, minari is not installed, or the
             data set exists.
     """
-    policy = _load_policy(options.policy) if options.policy else None  # first: see `envs.policy_training`
+    policy = _load_policy(options.policy) if options.policy else None
     from hydrotele.envs.offline_dataset import check_dataset_name, write_dataset
 
     if policy and options.logs:

@@ -65,7 +65,7 @@ def train_to_folder(options: TrainOptions) -> None:
         InputError: the task or an option is not valid, stable-baselines3 is not installed, or the folder
             contains something else.
     """
-    from hydrotele.envs import policy_training  # first: see its import of triton
+    from hydrotele.envs import policy_training
     from hydrotele.envs.learning_curve import plot_learning_curve
     from hydrotele.envs.policy_scores import estimate_share, evaluate_policies, make_baselines, make_vector_environment
 

@@ -4,7 +4,6 @@ The policy acts alone: no controller takes part. Its file is a plain stable-base
 is the observation of the environment, since the network itself normalises it (`NormalisingExtractor`).
 """
 
-import importlib.util
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +11,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
-
-if importlib.util.find_spec("triton"):  # a part of torch, which crashes if Mesa's LLVM (MUJOCO_GL=egl) is loaded first
-    import triton  # pyright: ignore[reportMissingImports] # noqa: F401
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
@@ -47,11 +43,6 @@ _FIRST_DIFFICULTY, _CURRICULUM_FRACTION = 0.2, 0.4  # goals at the start; part o
 
 def ignore_report(text: str, fraction: float) -> None:
     """Do nothing."""
-
-
-def return_false() -> bool:
-    """Return False."""
-    return False
 
 
 class NormalisingExtractor(_Extractor):
@@ -191,8 +182,9 @@ class _Supervisor(_Callback):
 
 
 def train_policy(
-    state: TrainingState, folder: Path, report: StageReport = ignore_report, is_stopped: Callable[[], bool] = return_false
-) -> Any:
+    state: TrainingState, folder: Path, report: StageReport = ignore_report,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Any:  # fmt: skip
     """Train a policy, or continue its training, and write it with its learning curve into a folder.
 
     Args:

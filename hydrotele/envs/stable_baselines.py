@@ -6,6 +6,8 @@ in the difference of two positions that vary by metres. It stacks the last steps
 of a machine show only over time. The agent may correct the action of a reference controller.
 """
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,6 +141,17 @@ class AgentInterface:
         return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
 
 
+def hide_triton_from_torch() -> None:
+    """Let torch find no Triton if Mesa's LLVM is loaded, since a second LLVM ends the process.
+
+    Mesa renders with MUJOCO_GL=egl on computers without a GPU; torch needs Triton on a GPU only.
+    """
+    maps = Path("/proc/self/maps")
+    if "triton" not in sys.modules and maps.exists() and "libLLVM" in maps.read_text():
+        sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - the documented way to block an import
+
+
+hide_triton_from_torch()
 try:
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore - an extra
 except ImportError:

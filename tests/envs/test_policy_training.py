@@ -7,13 +7,13 @@ import pytest
 
 pytest.importorskip("stable_baselines3", reason="the extra `learn` is not installed")
 
-from hydrotele.envs import policy_training  # noqa: E402, I001 - after the skip, and before mujoco
-import torch  # noqa: E402
+import torch  # noqa: E402 - after the skip
 from gymnasium.spaces import Box  # noqa: E402
 from stable_baselines3 import PPO  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from hydrotele.cli import main as cli  # noqa: E402
+from hydrotele.envs import policy_training  # noqa: E402
 from hydrotele.envs.learning_curve import TrainingPlan, TrainingState  # noqa: E402
 
 OPTIONS = {"variants": 2, "duration": 0.4, "control_rate": 25.0}
