@@ -15,7 +15,7 @@ POLICY_FILE, STATE_FILE, CURVE_FILE = "policy.zip", "training.json", "learning_c
 
 RECIPES: dict[str, dict[str, Any]] = {
     "TrackTrajectory": {"action": "joint_rate", "control_rate": 25.0},
-    "ReachFeller": {"action": "resolved_motion", "control_rate": 25.0},
+    "ReachFeller": {"action": "resolved_motion", "control_rate": 10.0},
 }
 """Task name -> options of the environment with which a policy is trained by default."""
 DEFAULT_RECIPE: dict[str, Any] = {"control_rate": 25.0}

@@ -36,7 +36,7 @@ StageReport = Callable[[str, float], None]
 
 _FEATURE_LIMIT = 10.0  # largest normalised input of the network
 _LEARNING_RATE, _MIN_RATE_FRACTION = 1.0e-3, 0.05  # step size at the start, and its fraction at the end
-_EVALUATIONS = 4  # evaluations of the policy during training
+_EVALUATIONS = 20  # evaluations of the policy during training
 _CURVE_EPISODES, _CURVE_SEED = 16, 2 * 10**6  # episodes of such an evaluation, seed of the first one
 _WARM_UP_STEPS = 50  # steps with random actions that give the first normalisation
 _FIRST_DIFFICULTY, _CURRICULUM_FRACTION = 0.2, 0.4  # goals at the start; part of the training until full size
