@@ -179,7 +179,7 @@ def compute_reach_reward(f, e, w):
 
     The distance is that of the true pose; 1 rad of the larger angle error counts as 1 m. The reward
     is 1 per metre minus 0.01 per step. Holding the pose within the tolerances (MAX_DISTANCE,
-    MAX_ANGLE) for HOLD_TIME adds 10 and ends the episode.
+    MAX_ANGLE, divided by the difficulty) for HOLD_TIME adds 10 and ends the episode.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -197,7 +197,7 @@ def compute_reach_reward(f, e, w):
     left = combine_pose_errors(distance, angle)
     reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST
     g[_REMAINING_DISTANCE] = left
-    inside = distance <= MAX_DISTANCE and angle <= MAX_ANGLE
+    inside = distance <= MAX_DISTANCE / f.difficulty and angle <= MAX_ANGLE / f.difficulty
     step = f.ticks * f.period
     g[_TIME_HELD] = g[_TIME_HELD] + step if inside else 0.0
     done = g[_TIME_HELD] >= HOLD_TIME - 0.5 * step

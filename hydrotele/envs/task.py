@@ -101,7 +101,7 @@ class Options:
             then has the term gamma Phi(s') - Phi(s) in addition, with the task's potential Phi. It does
             not change which policies are optimal for this gamma. 0 for the reward without it.
         difficulty: size of the goals, at most 1 (those of the task): rates of references, length and speed
-            of lines, distance of poses; for a curriculum.
+            of lines, distance of poses; tolerances of poses are divided by it. For a curriculum.
         start: positions of axes at the start of every episode [rad] or [m]; those of other axes are drawn.
     """
 

@@ -71,6 +71,14 @@ def test_difficulty_shortens_paths():
     assert distances[0] < 0.5 * distances[1]
 
 
+def test_difficulty_widens_the_tolerances_of_a_pose():
+    core = make_task_core("ReachFeller", SHORT | {"difficulty": 0.01}, 4, 1, DISABLED)  # 5 m and 3 rad
+    core.reset(np.arange(4))
+    for _ in range(13):  # 0.5 s at 25 Hz
+        core.step(np.zeros(core.action.shape))
+    assert core.measures[:, 2].all() and core.terminated.all()
+
+
 def test_an_episode_starts_in_the_given_pose():
     start = {"boom": 0.3, "stick": -1.5}
     core = make_task_core("TrackTrajectory", SHORT | {"start": start}, 3, 1, DISABLED)
