@@ -17,7 +17,10 @@ from matplotlib import layout_engine
 
 # Their extra, `learn`, brings torch, 3 GB, so tools/setup --test leaves it out; the last lines of
 # the suite say so, and tools/nightly has a check `learn`, which runs them with it.
-_LEARN = ("envs/test_stable_baselines.py", "run/test_learned_policy.py", "tools/test_learn.py")
+_LEARN = (
+    "envs/test_policy_training.py", "envs/test_stable_baselines.py", "run/test_learned_policy.py",
+    "tools/test_learn.py",
+)  # fmt: skip
 collect_ignore = [] if importlib.util.find_spec("stable_baselines3") else [*_LEARN]
 
 # Has to be settled before the first import of mujoco or dm_control.

@@ -29,6 +29,7 @@ from hydrotele.cli.option_values import (
 )
 from hydrotele.cli.program_help import DESCRIPTION, format_program_help
 from hydrotele.cli.serve_command import SERVE_EPILOG, serve
+from hydrotele.cli.train_options import RECORD_EPILOG, TRAIN_EPILOG, record, train
 from hydrotele.core.errors import InputError
 
 
@@ -320,6 +321,8 @@ def run(
 app.command(epilog=DRIVE_EPILOG)(drive)
 app.command("haptic-device", epilog=HAPTIC_EPILOG)(haptic_device)
 app.command(epilog=SERVE_EPILOG)(serve)
+app.command(epilog=TRAIN_EPILOG)(train)
+app.command(epilog=RECORD_EPILOG)(record)
 app.command(epilog=SWEEP_EPILOG)(sweep)
 app.command(epilog=COMPARE_EPILOG)(compare)
 app.command(epilog=LINEARISE_EPILOG)(linearise)

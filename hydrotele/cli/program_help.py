@@ -42,6 +42,10 @@ COMMAND_GROUPS = {
         "linearise": "Compute linear state-space models of a machine at poses; list natural frequencies and damping.",
         "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
     },
+    "Learn": {
+        "train": "Train a policy for a control task with PPO; compare it with the reference controller.",
+        "record": "Record episodes of a control task as a Minari data set, from a controller, a policy or logs.",
+    },
     "Models and files": {
         "new": "Create a machine from a robot description: URDF, xacro or MJCF.",
         "list": "List the available machines, scenarios, sweeps, effects and environments.",

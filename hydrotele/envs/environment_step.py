@@ -42,6 +42,7 @@ from hydrotele.envs.observation import write_machine_observation
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TICK,
     call_task_part,
@@ -249,6 +250,24 @@ def _check_stability(f, e, d):
 
 
 @compiled
+def _compute_potential(f, w):
+    """Return the potential of the current state, 0 without shaping."""
+    return call_task_part(f, w, POTENTIAL, 0) if f.shaping > 0.0 else 0.0
+
+
+@compiled
+def _shape_reward(f, e, reward, potential):
+    """Add the potential-based shaping F = gamma Phi(s') - Phi(s) to the reward of a step from s to s'; store Phi(s').
+
+    Source: Ng, Harada, Russell 1999, Policy invariance under reward transformations, theorem 1. Phi
+    is 0 in a terminal state.
+    """
+    reward += f.shaping * potential - e.potential
+    e.potential = potential
+    return reward
+
+
+@compiled
 def _begin_episode(f, e, w):
     """Draw a variant, set the simulation to its start state, and let the task draw a new goal.
 
@@ -285,6 +304,7 @@ def _begin_episode(f, e, w):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
     w.measures[:] = 0.0
     call_task_part(f, w, BEGIN, 0)
+    e.potential = _compute_potential(f, w)
 
 
 @compiled
@@ -326,9 +346,10 @@ def _run_environment_step(f, e, w, action):
     if _check_stability(f, e, w.data):
         e.fault = 1
         e.faults += 1
-        return 0.0, True, False
+        return _shape_reward(f, e, 0.0, 0.0), True, False
     reward = call_task_part(f, w, REWARD, 0)
     done = e.over != 0
+    reward = _shape_reward(f, e, reward, 0.0 if done else _compute_potential(f, w))
     return reward, done, e.step >= f.horizon and not done
 
 

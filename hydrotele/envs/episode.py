@@ -58,6 +58,7 @@ EPISODE_STATE = np.dtype(
         ("command", _F, MAX_AXES),  # valve and drive commands [1], or in the drive's unit
         ("drive", _F, (4, MAX_AXES)),  # reference drive velocity, moment arm, two chamber volumes
         ("work", _F),  # positive work of the hydraulic drives on the mechanism since the start [J]
+        ("potential", _F),  # potential of the current state, 0 without shaping
         ("goal", _F, GOAL_SIZE),  # values of the task
     ],
     align=True,
@@ -111,6 +112,8 @@ TASK_PARAMETERS = np.dtype(
         ("accuracy", _F, MAX_CHANNELS),  # bound of the uniform random error of every sensor
         ("converters", _F, (3, MAX_CHANNELS)),  # see machine.sensors.make_channel_converter
         ("parameters", _F, MAX_PARAMETERS),  # task parameters
+        ("shaping", _F),  # discount factor of the potential-based shaping, 0 without shaping
+        ("difficulty", _F),  # size of the goals of new episodes, 1 for those of the task
         ("delayed_command", _I),  # control periods in the command ring buffer, 0 without delays
         ("delayed_sensor", _I),  # physics steps in the sensor ring buffer, 0 without delays
         ("variants", _I),

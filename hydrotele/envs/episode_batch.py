@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.control.servo import tabulate_drive_geometry
-from hydrotele.core.datafile import validate_data
+from hydrotele.core.datafile import suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.envs.environment_step import step_or_reset_simulation
 from hydrotele.envs.episode import (
@@ -43,6 +43,7 @@ MAX_VARIANTS = 10_000
 """Largest number of variants; each takes some milliseconds to prepare."""
 MAX_THREADS = 1024
 """Largest number of threads that step the episodes."""
+_MIN_DIFFICULTY = 0.01  # smallest size of the goals: the rates of a reference of size 0 would be 0 / 0
 
 
 def check_count(name: str, count: int, least: int, most: int) -> None:
@@ -75,10 +76,17 @@ def make_task_setup(task: Task, options: Options) -> TaskSetup:
         duration=task.duration if options.duration is None else options.duration,
     )  # fmt: skip
     check_count("variants", options.variants, 1, MAX_VARIANTS)
+    for name, low in (("shaping", 0.0), ("difficulty", _MIN_DIFFICULTY)):
+        if not low <= (value := getattr(options, name)) <= 1.0:
+            raise InputError(name, f"must be from {low:g} to 1, not {value:g}")
     machine, clock = load_task_machine(task, options), make_timing(options)
     arm = arm_axes(machine) if machine.arm else ()
+    driven = (*arm, *task.extra_axes)
+    for name in options.start or {}:
+        if name not in driven:
+            raise InputError(f"start.{name}", suggest_valid_name(name, driven))
     variants = make_variants(task, options, machine)
-    axes = (*arm, *task.extra_axes) or variants.plant.axes
+    axes = driven or variants.plant.axes
     readings = list_machine_observation_fields(machine, axes, len(arm)) if task.with_readings else []
     fields = [*readings, *task.fields(machine, axes)]
     table = tabulate_drive_geometry(machine, variants.plant.axes)[1]

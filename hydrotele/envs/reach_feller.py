@@ -11,10 +11,18 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, arm_values, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_pose_observation_fields, max_reach
-from hydrotele.envs.task import Task, compute_measured_pose, compute_path_effort, sample_start_positions, wrap_angle
+from hydrotele.envs.task import (
+    Task,
+    compute_measured_pose,
+    compute_path_effort,
+    count_recovery_steps,
+    sample_start_positions,
+    wrap_angle,
+)
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TASK_SIGNATURE,
     episode_states_view,
@@ -84,7 +92,7 @@ def draw_reach_goal(f, e):
     """
     g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
     compute_tip_pose(f.arm, arm_values(f, e.position), start)
-    size = 1.0
+    size = f.difficulty
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
             size *= _SHRINK_FACTOR  # the start is inside the workspace, so a close pose is reachable
@@ -171,7 +179,7 @@ def compute_reach_reward(f, e, w):
 
     The distance is that of the true pose; 1 rad of the larger angle error counts as 1 m. The reward
     is 1 per metre minus 0.01 per step. Holding the pose within the tolerances (MAX_DISTANCE,
-    MAX_ANGLE) for HOLD_TIME adds 10 and ends the episode.
+    MAX_ANGLE, divided by the difficulty) for HOLD_TIME adds 10 and ends the episode.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -189,12 +197,31 @@ def compute_reach_reward(f, e, w):
     left = combine_pose_errors(distance, angle)
     reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST
     g[_REMAINING_DISTANCE] = left
-    inside = distance <= MAX_DISTANCE and angle <= MAX_ANGLE
+    inside = distance <= MAX_DISTANCE / f.difficulty and angle <= MAX_ANGLE / f.difficulty
     step = f.ticks * f.period
     g[_TIME_HELD] = g[_TIME_HELD] + step if inside else 0.0
     done = g[_TIME_HELD] >= HOLD_TIME - 0.5 * step
     w.measures[0], w.measures[1], w.measures[2] = distance, angle, 1.0 if done else 0.0
     return reward + (SUCCESS_REWARD if done else 0.0), done
+
+
+@compiled
+def compute_reach_potential(f, e):
+    """Return the potential of the true pose: the success reward, discounted until all errors have vanished.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
+
+    Returns:
+        The potential, scalar: 10 gamma^n, where the sum of position, attitude and head error vanishes in n steps.
+
+    Source: `count_recovery_steps`.
+    """
+    arm, target = arm_values(f, e.position), e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
+    distance, _ = _compute_true_pose_errors(f, e)
+    angles = abs(wrap_angle(arm[1] + arm[2] + arm[3] - target[3])) + abs(arm[4] - target[4])
+    return SUCCESS_REWARD * f.shaping ** count_recovery_steps(f, combine_pose_errors(distance, angles))
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
@@ -231,10 +258,10 @@ def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `ReachFeller` for the simulation `number`, in native code.
 
     `part` is BEGIN (draw the goal pose of a new episode), TICK (do nothing), OBSERVE (write
-    the task's values to the observation, from the address `out` on) or REWARD (return the reward
-    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
-    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
-    `task_interface.TASK_SIGNATURE`.
+    the task's values to the observation, from the address `out` on), REWARD (return the reward
+    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument`
+    are the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 for the other parts;
+    see `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
@@ -244,4 +271,6 @@ def run_task_part(part, m, d, number, argument, out):
         write_reach_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
         return store_episode_end(e, compute_reach_reward(f, e, w))
+    elif part == POTENTIAL:
+        return compute_reach_potential(f, e)
     return 0.0

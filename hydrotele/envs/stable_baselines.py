@@ -7,6 +7,8 @@ of a machine show only over time. The agent may correct the action of a referenc
 """
 
 import copy
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +16,7 @@ from gymnasium.spaces import Box
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
-from hydrotele.envs.episode import SAME_STEP
-from hydrotele.envs.gymnasium_env import make_action_space, make_observation_space
-from hydrotele.envs.task_catalogue import make_task_core
+from hydrotele.envs.policy_scores import make_vector_environment
 from hydrotele.envs.task_setup import TaskSetup
 
 
@@ -142,6 +142,17 @@ class AgentInterface:
         return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
 
 
+def hide_triton_from_torch() -> None:
+    """Let torch find no Triton if Mesa's LLVM is loaded, since a second LLVM ends the process.
+
+    Mesa renders with MUJOCO_GL=egl on computers without a GPU; torch needs Triton on a GPU only.
+    """
+    maps = Path("/proc/self/maps")
+    if "triton" not in sys.modules and maps.exists() and "libLLVM" in maps.read_text():
+        sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - the documented way to block an import
+
+
+hide_triton_from_torch()
 try:
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore - an extra
 except ImportError:
@@ -154,6 +165,7 @@ class StableVecEnv(_VecEnvBase):
     """A stable-baselines3 VecEnv with n environments of a task.
 
     Attributes:
+        env: the vector environment of gymnasium.
         core: the running task.
         view: transform between environment and agent, None for plain observations and actions.
     """
@@ -165,7 +177,8 @@ class StableVecEnv(_VecEnvBase):
         """Create the environments: compile the machine variants and define the spaces.
 
         Args:
-            task: name of the task, or a class or object of `PythonTask`.
+            task: name of a task, class or object of `PythonTask`, or gymnasium id of an environment with a
+                `vector_entry_point`.
             num_envs: number of environments n.
             threads: number of threads that step the environments; 0 for one per core.
             view: transform between environment and agent, made from the same task and options.
@@ -178,15 +191,33 @@ class StableVecEnv(_VecEnvBase):
         if VecEnv is None:
             message = "needs stable-baselines3: pip install 'hydrotele[learn]'"
             raise InputError("StableVecEnv", message)
-        self.core, self.view = make_task_core(task, options, num_envs, threads, SAME_STEP), view
+        self.env: Any = make_vector_environment(task, num_envs, threads, **options)
+        self.core, self.view = self.env.unwrapped.core, view
         self.render_mode = None
-        space = make_observation_space(self.core)
+        space = self.env.single_observation_space
         if view:
             space = Box(-np.inf, np.inf, (view.observation_size,), np.float32)
-        super().__init__(num_envs, space, make_action_space(self.core))
+        super().__init__(num_envs, space, self.env.single_action_space)
         self._infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
         self._finished = np.zeros(0, int)
+        self._desynchronising_seed: int | None = None
         self._return, self._length = np.zeros(num_envs), np.zeros(num_envs, int)
+
+    @property
+    def difficulty(self) -> float:
+        """Size of the goals of new episodes, from 0.01 to 1 (those of the task)."""
+        return float(self.core.parameters["difficulty"])
+
+    def set_difficulty(self, difficulty: float) -> None:
+        """Set the size of the goals of new episodes, see `difficulty` of `hydrotele.envs.task.Options`."""
+        self.core.parameters["difficulty"] = difficulty
+
+    def desynchronise(self, seed: int) -> None:
+        """Let the first episodes after the next `reset` end at random times.
+
+        Otherwise the episodes of a batch begin at the same time and are always in the same phase.
+        """
+        self._desynchronising_seed = seed
 
     def reset(self) -> np.ndarray:
         """Start an episode in every environment, with the seed given to the method `seed` before, or a random one.
@@ -194,15 +225,19 @@ class StableVecEnv(_VecEnvBase):
         Returns:
             (n, o) observations, those of the agent if there is a `view`.
         """
-        drawn = np.random.default_rng().integers(2**62, size=self.num_envs)
-        given = zip(self._seeds, drawn, strict=True)
-        self.core.reset(np.array([d if seed is None else seed for seed, d in given]))
+        observation, _ = self.env.reset(seed=list(self._seeds))
         self._reset_seeds()
         self._return[:], self._length[:] = 0.0, 0
+        if self._desynchronising_seed is not None:
+            steps = np.random.default_rng(self._desynchronising_seed).integers(
+                self.core.setup.clock.horizon, size=self.num_envs
+            )
+            self.core.episodes["step"] = steps
+            self._desynchronising_seed = None
         if self.view:
             self.view.begin(self.num_envs)
-            return self.view.make_agent_observation(self.core.observation)
-        return self.core.observation.copy()
+            return self.view.make_agent_observation(observation)
+        return observation
 
     def step_async(self, actions: np.ndarray) -> None:
         """Store the actions (n, a) for `step_wait`.
@@ -222,40 +257,41 @@ class StableVecEnv(_VecEnvBase):
             episode ended holds `terminal_observation`, `TimeLimit.truncated`, `episode` and the
             task measures; the others are empty.
         """
-        core, view = self.core, self.view
-        core.step(view.make_environment_action(self._pending_actions) if view else self._pending_actions)
-        self._return += core.reward
+        view, action = self.view, self._pending_actions
+        observation, reward, terminated, truncated, info = self.env.step(
+            view.make_environment_action(action) if view else action
+        )
+        self._return += reward
         self._length += 1
-        over = (core.terminated | core.truncated) != 0
-        ended = np.flatnonzero(over)
+        over = terminated | truncated
         for number in self._finished:
             self._infos[number] = {}
-        self._finished = ended
+        ended = self._finished = np.flatnonzero(over)
         if len(ended):
+            last = np.array(observation)
+            last[ended] = np.stack(info["final_obs"][ended])
             self._write_final_infos(
-                ended,
-                view.make_final_agent_observation(core.final_observation, ended)
-                if view
-                else core.final_observation[ended],
-            )
+                ended, view.make_final_agent_observation(last, ended) if view else last[ended], truncated,
+                info["final_info"],
+            )  # fmt: skip
             if view:
                 view.reset(over)
-        seen = view.make_agent_observation(core.observation) if view else core.observation.copy()
-        return seen, core.reward.astype(np.float32), over, self._infos
+        seen = view.make_agent_observation(observation) if view else observation
+        return seen, reward.astype(np.float32), over, self._infos
 
-    def _write_final_infos(self, ended: np.ndarray, last: np.ndarray) -> None:
+    def _write_final_infos(self, ended: np.ndarray, last: np.ndarray, truncated: np.ndarray, final: dict) -> None:
         """Write the infos of the episodes that ended: task measures, last observation, return and length.
 
-        `ended` (m,) are the indices of the environments and `last` (m, ...) the final observations.
-        Return and length of these environments are set to 0 for the next episode.
+        `ended` (m,) are the indices of the environments, `last` (m, ...) the final observations and `final` the
+        final infos. Return and length of these environments are set to 0 for the next episode.
         """
-        names = [name for name, _ in self.core.setup.task.measures]
+        names = [name for name in final if not name.startswith("_")]
         for row, i in enumerate(ended):
-            figures = dict(zip(names, self.core.final_measures[i].tolist(), strict=False))
+            figures = {name: final[name][i].item() for name in names}
             total, length = float(self._return[i]), int(self._length[i])
             self._infos[i] = {
                 **figures, "terminal_observation": last[row],
-                "TimeLimit.truncated": bool(self.core.truncated[i]),
+                "TimeLimit.truncated": bool(truncated[i]),
                 "episode": {"r": total, "l": length, "t": 0.0},
             }  # fmt: skip
         self._return[ended], self._length[ended] = 0.0, 0
@@ -279,7 +315,7 @@ class StableVecEnv(_VecEnvBase):
 
     def close(self) -> None:
         """Free the memory of the simulations."""
-        self.core.close()
+        self.env.close()
 
     def _count_indices(self, indices: Any) -> int:
         return self.num_envs if indices is None else len(np.atleast_1d(indices))

@@ -16,6 +16,7 @@ from hydrotele.envs.task import (
     Task,
     compute_measured_pose,
     compute_path_effort,
+    compute_tracking_potential,
     sample_start_positions,
     size_ratio,
     wrap_angle,
@@ -23,6 +24,7 @@ from hydrotele.envs.task import (
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TASK_SIGNATURE,
     episode_states_view,
@@ -120,7 +122,7 @@ def draw_line_goal(f, e):
     turn = draw_uniform_between(e, -_MAX_SWING_PER_METRE, _MAX_SWING_PER_METRE) / ratio
     if draw_uniform(e) >= _SWING_FRACTION:
         turn = 0.0
-    size = 1.0
+    size = f.difficulty
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
             size *= _SHRINK_FACTOR  # the start is inside the workspace, so a short slow line fits
@@ -270,6 +272,21 @@ def reward_from_errors(across, along, attitude):
 
 
 @compiled
+def compute_true_line_errors(f, e):
+    """Return the true errors of an episode, from its records of TASK_PARAMETERS and EPISODE_STATE.
+
+    They are (error across the line [m], error along the line [m], attitude error [rad]), scalars.
+    """
+    pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
+    compute_line_pose(e.goal, e.tick * f.period, pose, rate)
+    r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
+    along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
+    arm = arm_values(f, e.position)
+    attitude = arm[1] + arm[2] + arm[3] - pose[_ATTITUDE]
+    return across, along, attitude
+
+
+@compiled
 def compute_line_reward(f, e, w):
     """Compute the reward of a step from the true errors of tip position and attitude.
 
@@ -284,12 +301,7 @@ def compute_line_reward(f, e, w):
 
     Source: `reward_from_errors`.
     """
-    pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
-    compute_line_pose(e.goal, e.tick * f.period, pose, rate)
-    r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
-    along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
-    arm = arm_values(f, e.position)
-    attitude = arm[1] + arm[2] + arm[3] - pose[_ATTITUDE]
+    across, along, attitude = compute_true_line_errors(f, e)
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
     return reward_from_errors(across, along, attitude), False
 
@@ -336,10 +348,10 @@ def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `StraightLine` for the simulation `number`, in native code.
 
     `part` is BEGIN (draw the line of a new episode), TICK (do nothing), OBSERVE (write
-    the task's values to the observation, from the address `out` on) or REWARD (return the reward
-    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
-    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
-    `task_interface.TASK_SIGNATURE`.
+    the task's values to the observation, from the address `out` on), REWARD (return the reward
+    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument`
+    are the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 for the other parts;
+    see `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
@@ -349,4 +361,7 @@ def run_task_part(part, m, d, number, argument, out):
         write_line_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
         return store_episode_end(e, compute_line_reward(f, e, w))
+    elif part == POTENTIAL:
+        across, along, attitude = compute_true_line_errors(f, e)
+        return compute_tracking_potential(f, across + abs(along) + abs(attitude))
     return 0.0

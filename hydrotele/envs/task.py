@@ -132,6 +132,12 @@ class Options:
             `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
         phase: phase of the task that an episode consists of, for a curriculum; only for tasks with phases
             (`LoadTruck`: `dig`, `haul`, `dump`, `return`, `cycle`).
+        shaping: discount factor gamma of the learner, at most 1; the reward of every step from state s to s'
+            then has the term gamma Phi(s') - Phi(s) in addition, with the task's potential Phi. It does
+            not change which policies are optimal for this gamma. 0 for the reward without it.
+        difficulty: size of the goals, at most 1 (those of the task): rates of references, length and speed
+            of lines, distance of poses; tolerances of poses are divided by it. For a curriculum.
+        start: positions of axes at the start of every episode [rad] or [m]; those of other axes are drawn.
     """
 
     machine: str | Path | Machine | None = None
@@ -147,6 +153,9 @@ class Options:
     timestep: float = 1.0e-3
     servo: dict[str, Any] = dataclasses.field(default_factory=dict)
     phase: str | None = None
+    shaping: float = 0.0
+    difficulty: float = 1.0
+    start: dict[str, float] | None = None
 
 
 assert set(ACTIONS) == set(ActionKind.__args__)
@@ -299,6 +308,38 @@ def compute_measured_pose(f, e, pose):
     Source: `kinematics.task_space.compute_tip_pose`.
     """
     compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
+
+
+RECOVERY_SPEED = 0.5  # m/s, speed at which potentials assume that an error decreases
+MAX_STEP_LOSS = 2.0  # difference of the largest and the smallest reward of a step in a tracking task
+
+
+@compiled
+def count_recovery_steps(f, error):
+    """Return the environment steps, scalar, in which an error [m] vanishes at RECOVERY_SPEED; 1 rad counts as 1 m.
+
+    `f` is the record of TASK_PARAMETERS.
+    """
+    return error / (RECOVERY_SPEED * f.ticks * f.period)
+
+
+@compiled
+def compute_tracking_potential(f, error):
+    """Return the potential of a tracking error: minus the discounted reward that is lost until it has vanished.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        error: position error, scalar [m]; 1 rad counts as 1 m.
+
+    Returns:
+        The potential, scalar: -2 (1 - gamma^n) / (1 - gamma) for n steps until the error has vanished.
+
+    Source: sum of a geometric series; rewards of `TrackTrajectory` and `StraightLine`.
+    """
+    steps = count_recovery_steps(f, error)
+    if f.shaping >= 1.0:
+        return -MAX_STEP_LOSS * steps
+    return -MAX_STEP_LOSS * (1.0 - f.shaping**steps) / (1.0 - f.shaping)
 
 
 @compiled

@@ -18,16 +18,17 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.memory import address_to_pointer, float64_view, struct_field_view
 from hydrotele.envs.episode import EPISODE_STATE, MAX_MEASURES, TASK_PARAMETERS
 
-BEGIN, TICK, OBSERVE, REWARD = range(4)
+BEGIN, TICK, OBSERVE, REWARD, POTENTIAL = range(5)
 """Parts of a task's native code: start an episode, act after a control period, write the
-observation of the task, compute the reward of a step."""
+observation of the task, compute the reward of a step, compute the potential of the current state."""
 
 TASK_SIGNATURE = types.float64(*(types.int64,) * 6)
-"""Signature of the native code of a task: (part, m, d, number, argument, out) -> reward for REWARD, otherwise 0.
+"""Signature of the native code of a task: (part, m, d, number, argument, out) -> reward or potential, otherwise 0.
 
-`part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation) or
-REWARD. `number` is the index of the simulation; `m`, `d`, `argument` and `out` are the addresses of
-mjModel, mjData, TASK_PARAMETERS and the observation (float32)."""
+`part` is BEGIN (start an episode), TICK (after a control period), OBSERVE (write the observation),
+REWARD or POTENTIAL (only with shaping; 0 if the task has no potential). `number` is the index of the
+simulation; `m`, `d`, `argument` and `out` are the addresses of mjModel, mjData, TASK_PARAMETERS and
+the observation (float32)."""
 
 
 class SimulationView(NamedTuple):
@@ -151,11 +152,12 @@ def call_task_part(f, w, part, out):
     Args:
         f: record of TASK_PARAMETERS.
         w: SimulationView.
-        part: BEGIN, TICK, OBSERVE or REWARD, scalar.
+        part: BEGIN, TICK, OBSERVE, REWARD or POTENTIAL, scalar.
         out: address of the float32 output of OBSERVE, scalar; 0 for the other parts.
 
     Returns:
-        The reward, scalar, for REWARD, which also writes `over` of the episode; otherwise 0.
+        The reward, scalar, for REWARD, which also writes `over` of the episode; the potential, scalar,
+        for POTENTIAL; otherwise 0.
 
     Source: this module.
     """

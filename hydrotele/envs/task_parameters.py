@@ -60,6 +60,7 @@ def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.nda
     clock = setup.clock
     facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]
     facts["timestep"], facts["acceleration"] = options.timestep, MAX_ACCELERATION
+    facts["shaping"], facts["difficulty"] = options.shaping, options.difficulty
     facts["axes"], facts["hydraulic"] = len(plant.axes), plant.hydraulic
     facts["supplies"] = len(plant.machine.supply_channels)
     facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)

@@ -12,10 +12,11 @@ import numpy as np
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.envs.episode import MAX_ARM_AXES, MAX_AXES, draw_uniform, draw_uniform_between
 from hydrotele.envs.observation import ObservationField, make_position_observation_field, make_rate_observation_field
-from hydrotele.envs.task import Task
+from hydrotele.envs.task import Task, compute_tracking_potential
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TASK_SIGNATURE,
     episode_states_view,
@@ -81,7 +82,7 @@ def draw_track_references(f, e):
     for a in range(f.axes_driven):
         i = f.driven_axis[a]
         g[_BASE + i] = e.reference[i]
-        fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i]
+        fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i] * f.difficulty
         total, rate = 0.0, 0.0
         for h in range(_HARMONIC_COUNT):
             place = _HARMONIC_COUNT * i + h
@@ -92,7 +93,7 @@ def draw_track_references(f, e):
         low, high = f.ranges[i, 0] - g[_BASE + i], f.ranges[i, 1] - g[_BASE + i]
         room = max(0.0, _MAX_RANGE_FRACTION * min(-low, high, _DEFAULT_RANGE))
         # relative to its start, a sine reaches up to twice its amplitude on one side
-        scale = min(fastest / rate, 0.5 * room / total)
+        scale = min(fastest / rate, 0.5 * room / total * f.difficulty)
         for h in range(_HARMONIC_COUNT):
             g[_SINE + _HARMONIC_COUNT * i + h] *= scale
             g[_COSINE + _HARMONIC_COUNT * i + h] *= scale
@@ -157,11 +158,24 @@ def write_track_observation(f, e, out, at):
 
 
 @compiled
+def compute_track_error(f, e):
+    """Return the distance of the true tip position from the one that follows from the axis references, scalar [m].
+
+    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE. The kinematics are the nominal ones.
+    """
+    now = e.tick * f.period
+    q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
+    for a in range(f.arm_axes):
+        q[a] = compute_axis_reference(e.goal, f.driven_axis[a], now)[0]
+    compute_tip_pose(f.arm, q, pose)
+    x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
+    square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2
+    return math.sqrt(square)
+
+
+@compiled
 def compute_track_reward(f, e, w):
     """Compute the reward of a step: 1 minus 1 for every 0.1 m of tip error, at least -1.
-
-    The error is the distance of the true tip position from the position that follows from the axis
-    references by the nominal kinematics.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -171,16 +185,9 @@ def compute_track_reward(f, e, w):
     Returns:
         (reward, False), scalars; False because this task never ends an episode early.
 
-    Source: this module.
+    Source: `compute_track_error`.
     """
-    now = e.tick * f.period
-    q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
-    for a in range(f.arm_axes):
-        q[a] = compute_axis_reference(e.goal, f.driven_axis[a], now)[0]
-    compute_tip_pose(f.arm, q, pose)
-    x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
-    square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2
-    error = math.sqrt(square)
+    error = compute_track_error(f, e)
     w.measures[0] = error
     return max(-1.0, 1.0 - error / ERROR_PER_REWARD), False
 
@@ -190,10 +197,10 @@ def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `TrackTrajectory` for the simulation `number`, in native code.
 
     `part` is BEGIN (draw the references of a new episode), TICK (do nothing), OBSERVE (write
-    the task's values to the observation, from the address `out` on) or REWARD (return the reward
-    and store whether the episode ends). `m`, `d` and `argument` are the addresses of mjModel,
-    mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
-    `task_interface.TASK_SIGNATURE`.
+    the task's values to the observation, from the address `out` on), REWARD (return the reward
+    and store whether the episode ends) or POTENTIAL (return the potential). `m`, `d` and `argument`
+    are the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 for the other parts;
+    see `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
@@ -203,6 +210,8 @@ def run_task_part(part, m, d, number, argument, out):
         write_track_observation(f, e, observation_view(f, out), 0)
     elif part == REWARD:
         return store_episode_end(e, compute_track_reward(f, e, w))
+    elif part == POTENTIAL:
+        return compute_tracking_potential(f, compute_track_error(f, e))
     return 0.0
 
 

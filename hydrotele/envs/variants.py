@@ -83,7 +83,7 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     ranges, folder = split_randomise(options)
     written = folder and [file.stat().st_mtime_ns for file in sorted(folder.glob("posterior*")) if file.is_file()]
     key = repr((task.name, id(task), nominal, options.effects, ranges, folder and resolve_path(folder), written,
-                options.variants, options.variant_seed, options.timestep, options.phase))  # fmt: skip
+                options.variants, options.variant_seed, options.timestep, options.phase, options.start))  # fmt: skip
     if key not in _CACHE:
         made = _build_variants(task, options, nominal, ranges, _choose_machine(options, folder, nominal))
         _CACHE[key] = made, task  # the task is kept, so that no other one gets its id
@@ -131,7 +131,7 @@ def _build_variants(
     machines, plants, states, tips = [], [], [], []
     for number in range(options.variants):
         rng = np.random.default_rng([options.variant_seed, number])
-        joints = task.start(nominal, rng)
+        joints = {**task.start(nominal, rng), **(options.start or {})}
         things = task.surroundings(nominal, rng, joints)
         machine = _apply_effects(choose_machine(number), options.effects, ranges, rng)
         known = (p for m, p in zip(machines, plants, strict=True)

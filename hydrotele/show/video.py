@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 import mujoco
 import numpy as np
@@ -43,11 +43,6 @@ def write_video(
         InputError: imageio-ffmpeg is not installed, a linkage cannot be closed, OpenGL does not work,
             or the file cannot be written.
     """
-    try:
-        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        message = "needs the package imageio-ffmpeg: pip install 'hydrotele[video]'"
-        raise InputError("the video", message) from None
     things = logged_surroundings(log)
     model = compile_mechanism(machine, surroundings=things)
     rows = compute_joint_positions(machine, model, extract_joint_motion(machine, log), log)
@@ -60,23 +55,47 @@ def write_video(
     begin, end = float(log.time[0]), float(log.time[-1])
     times = np.arange(begin, end, 1.0 / _FRAME_RATE)
     canvas = Canvas(model, *size)
+
+    def draw_frames() -> Iterator[np.ndarray]:
+        for time in times:
+            row = min(int(np.searchsorted(log.time, time)), len(log) - 1)
+            data.qpos[:] = rows[min(row, len(rows) - 1)]
+            mujoco.mj_fwdPosition(model, data)
+            yield canvas.draw(model, data, camera, soil_markers(soil, row, poses, machine) if soil else ())
+            if progress:
+                progress(float(time) - begin, end - begin)
+
     try:
-        with atomic_file(path, ".mp4") as part:
-            frames = imageio_ffmpeg.write_frames(str(part), size, fps=_FRAME_RATE, quality=7)
-            frames.send(None)
-            try:
-                for time in times:
-                    row = min(int(np.searchsorted(log.time, time)), len(log) - 1)
-                    data.qpos[:] = rows[min(row, len(rows) - 1)]
-                    mujoco.mj_fwdPosition(model, data)
-                    markers = soil_markers(soil, row, poses, machine) if soil else ()
-                    frames.send(np.ascontiguousarray(canvas.draw(model, data, camera, markers)))
-                    if progress:
-                        progress(float(time) - begin, end - begin)
-            finally:
-                frames.close()
+        write_frames(path, size, _FRAME_RATE, draw_frames())
     finally:
         canvas.close()
+
+
+def write_frames(path: str | os.PathLike, size: tuple[int, int], rate: float, images: Iterable[np.ndarray]) -> None:
+    """Encode images as a video.
+
+    Args:
+        path: MP4 file, written completely or not at all.
+        size: width and height [pixel], multiples of 16.
+        rate: images per second [Hz].
+        images: (height, width, 3) uint8 each.
+
+    Raises:
+        InputError: imageio-ffmpeg is not installed, or the file cannot be written.
+    """
+    try:
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        message = "needs the package imageio-ffmpeg: pip install 'hydrotele[video]'"
+        raise InputError("the video", message) from None
+    with atomic_file(path, ".mp4") as part:
+        frames = imageio_ffmpeg.write_frames(str(part), size, fps=rate, quality=7)
+        frames.send(None)
+        try:
+            for image in images:
+                frames.send(np.ascontiguousarray(image))
+        finally:
+            frames.close()
 
 
 def _make_camera(model: mujoco.MjModel, tip: np.ndarray | None) -> mujoco.MjvCamera:
