@@ -632,7 +632,7 @@ def find_channel_sensor(machine: Machine, sensors: SensorSet | None, channel: st
 def rate_channels(machine: Machine) -> tuple[str, ...]:
     """Return the channels `velocity.AXIS` that a sensor set of a machine measures, in the order of its axes.
 
-    Rates that no sensor measures, such as differences of positions, contain no information of their own.
+    Rates that no sensor measures, such as differences of positions, contain no additional information.
     """
     channels = (f"velocity.{axis}" for axis in machine.axes)
     return tuple(c for c in channels if any(s.velocity or c in s.channels for s in machine.sensors.values()))
