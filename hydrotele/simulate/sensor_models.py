@@ -46,7 +46,7 @@ def sample_sensor_errors(
 
             kept = np.exp(-period / sensor.correlation_time)
             errors[1:] *= np.sqrt(1.0 - kept**2)
-            errors = lfilter([1.0], [1.0, -kept], errors)
+            errors = np.asarray(lfilter([1.0], [1.0, -kept], errors))
         return errors
     return stream.uniform(-1.0, 1.0, count) * sensor.accuracy
 

@@ -214,7 +214,7 @@ def test_the_controller_sees_what_the_log_shows():
     """Same defects, noise and converter in the fed-back reading and in the log's row."""
     asked = scenario(*DEFECTS, sensors="khoshzaban1992")
     measured = run_scenario(asked).measured
-    plant, data, plan, seen, _ = prepare_run(asked)
+    plant, data, plan, seen, *_ = prepare_run(asked)
     start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, 20)
     for tick in range(50):

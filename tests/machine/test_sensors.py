@@ -139,7 +139,7 @@ def test_ideal_and_unknown_sensors():
 
 def test_slow_sensors_are_held_for_the_controller():
     """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
-    plant, data, _, seen, _ = prepare_run(load_scenario("zhu_up"))
+    plant, data, _, seen, *_ = prepare_run(load_scenario("zhu_up"))
     assert seen.ticks_per_sample == 4 and seen.period == pytest.approx(0.02)
     readings, stepper = [], Stepper(plant, data, 5)
     for tick in range(9):
@@ -154,7 +154,7 @@ def test_slow_sensors_are_held_for_the_controller():
 def test_the_log_shows_what_the_controller_saw():
     """Feedback and log share sampling, errors and converter, clipped pressures included."""
     scenario = load_scenario("steps", {"duration": "3.0"})
-    plant, data, _, seen, _ = prepare_run(scenario)
+    plant, data, _, seen, *_ = prepare_run(scenario)
     seen.update(0, Stepper(plant, data, 5))
     log = run_scenario(scenario).measured
     for i, axis in enumerate(plant.axes):
