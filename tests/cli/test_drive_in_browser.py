@@ -259,6 +259,7 @@ def test_scene_is_drawn_without_errors_and_keys_do_not_move_its_camera(browser, 
     assert not errors
 
 
+@pytest.mark.nightly
 def test_foreign_sites_malformed_messages_and_slow_pages_do_no_harm(drive):
     """No browser is needed. A site in the user's browser could otherwise drive the machine."""
     for headers in ({"Origin": "http://example.org"}, {"Host": "example.org"}):
