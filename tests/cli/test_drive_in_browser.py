@@ -4,6 +4,7 @@ import contextlib
 import json
 import shutil
 import signal
+import re
 import socket
 import subprocess
 import sys
@@ -172,7 +173,8 @@ def test_second_page_watches_and_a_closed_page_leaves_the_machine_without_comman
     second.wait_for_function("status.role === 'watcher'")
     assert "only watches" in second.inner_text("#note") and second.is_disabled("#run")
     second.keyboard.down("KeyI")
-    assert second.evaluate("new Promise(done => setTimeout(() => done(status.rows[0][1]), 800))").count("z +0.")
+    row = second.evaluate("new Promise(done => setTimeout(() => done(status.rows[0][1]), 800))")
+    assert re.search(r"z [+-]0\.", row)  # mm
     second.keyboard.up("KeyI")
     first.keyboard.down("KeyI")
     handle_is_raised(second)
