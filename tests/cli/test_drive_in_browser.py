@@ -2,9 +2,9 @@
 
 import contextlib
 import json
+import re
 import shutil
 import signal
-import re
 import socket
 import subprocess
 import sys
