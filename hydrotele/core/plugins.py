@@ -136,6 +136,16 @@ def _run_file(path: Path) -> Any:
     return module
 
 
+def hide_triton_from_torch() -> None:
+    """Let torch find no Triton if Mesa's LLVM is loaded, since a second LLVM ends the process.
+
+    Mesa renders with MUJOCO_GL=egl on computers without a GPU; torch needs Triton on a GPU only.
+    """
+    maps = Path("/proc/self/maps")
+    if "triton" not in sys.modules and maps.exists() and "libLLVM" in maps.read_text():
+        sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - the documented way to block an import
+
+
 def require_library(name: str, extra: str, purpose: str) -> Any:
     """Import an optional library.
 

@@ -7,14 +7,13 @@ of a machine show only over time. The agent may correct the action of a referenc
 """
 
 import copy
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium.spaces import Box
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.plugins import hide_triton_from_torch
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.policy_scores import make_vector_environment
 from hydrotele.envs.task_setup import TaskSetup
@@ -140,16 +139,6 @@ class AgentInterface:
         """
         own = self._max_fraction * np.clip(action, -1.0, 1.0)
         return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
-
-
-def hide_triton_from_torch() -> None:
-    """Let torch find no Triton if Mesa's LLVM is loaded, since a second LLVM ends the process.
-
-    Mesa renders with MUJOCO_GL=egl on computers without a GPU; torch needs Triton on a GPU only.
-    """
-    maps = Path("/proc/self/maps")
-    if "triton" not in sys.modules and maps.exists() and "libLLVM" in maps.read_text():
-        sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - the documented way to block an import
 
 
 hide_triton_from_torch()

@@ -7,11 +7,9 @@ if the scenario lists its values. An object may have the attributes `action`, `r
 `begin(machine, axes)` that is called before the run.
 """
 
-import contextlib
 import json
-import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +20,13 @@ from hydrotele.control.arm_kinematics import arm_axes
 from hydrotele.core.datafile import suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import resolve_path
-from hydrotele.core.plugins import find_plugins, is_object_reference, load_object, require_library
+from hydrotele.core.plugins import (
+    find_plugins,
+    hide_triton_from_torch,
+    is_object_reference,
+    load_object,
+    require_library,
+)
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.pilots import PolicyPilot
 
@@ -192,14 +196,14 @@ def complete_policy_pilot(pilot: PolicyPilot, policy: Policy, machine: Machine, 
 
 def _load_stable_baselines(path: Path) -> Callable[[np.ndarray], np.ndarray]:
     name = _find_algorithm(path)
-    with _hidden_triton():
-        require_library("torch", "learn", f"policy {path}")
-        library = require_library("stable_baselines3", "learn", f"policy {path}")
-        try:
-            model = getattr(library, name).load(path, device="cpu")
-        except Exception as error:  # the file holds pickled objects of any kind
-            message = f"cannot be loaded as a policy of {name}: {type(error).__name__}: {error}"
-            raise InputError(path, message) from error
+    hide_triton_from_torch()
+    require_library("torch", "learn", f"policy {path}")
+    library = require_library("stable_baselines3", "learn", f"policy {path}")
+    try:
+        model = getattr(library, name).load(path, device="cpu")
+    except Exception as error:  # the file holds pickled objects of any kind
+        message = f"cannot be loaded as a policy of {name}: {type(error).__name__}: {error}"
+        raise InputError(path, message) from error
     size = model.observation_space.shape
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -224,8 +228,8 @@ def _find_algorithm(path: Path) -> str:
 
 
 def _load_torchscript(path: Path) -> Callable[[np.ndarray], np.ndarray]:
-    with _hidden_triton():
-        torch = require_library("torch", "learn", f"policy {path}")
+    hide_triton_from_torch()
+    torch = require_library("torch", "learn", f"policy {path}")
     try:
         module = torch.jit.load(path, map_location="cpu").eval()
     except (RuntimeError, ValueError) as error:
@@ -240,23 +244,6 @@ def _load_torchscript(path: Path) -> Callable[[np.ndarray], np.ndarray]:
                 raise InputError(path, f"does not accept {len(observation)} values: {last}") from None
 
     return act
-
-
-@contextlib.contextmanager
-def _hidden_triton() -> Iterator[None]:
-    """Make the library triton appear absent, unless it is loaded already.
-
-    It contains LLVM. Its import after that of OpenGL, which may contain another LLVM, ends the process.
-    Policies need it on no device.
-    """
-    if "triton" in sys.modules:
-        yield
-        return
-    sys.modules["triton"] = None  # pyright: ignore[reportArgumentType] - documented: the import then fails
-    try:
-        yield
-    finally:
-        del sys.modules["triton"]
 
 
 def _load_onnx(path: Path) -> Callable[[np.ndarray], np.ndarray]:
