@@ -83,13 +83,18 @@ def run_to_folder(
     check_output_folder(target, "run")
     with show_simulation_progress(f"run {scenario.name}", quiet=as_json) as progress:
         result = run_scenario(scenario, progress)
+    return write_and_print_run(result, target, review, as_json)
+
+
+def write_and_print_run(result: Run, target: Path, review: bool, as_json: bool, hint: str = "") -> Path:
+    """Write a run completely or not at all, print its summary and then where it is and a hint; return its folder."""
     with atomic_folder(target, "run") as folder:
         write_run(result, folder, review)
     if as_json:
         print_json({**result.summary, "folder": str(target)})
     else:
         print_summary(result.summary)
-        stdout_console.print(f"written to [bold]{target}[/]")
+        stdout_console.print(f"written to [bold]{target}[/]{hint}")
     return target
 
 

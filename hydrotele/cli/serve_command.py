@@ -63,9 +63,9 @@ def serve_to_folder(
         InputError: scenario, address or target are not usable, or the run is too short for a log.
         SimulationFailed: the state of the simulation is no longer finite.
     """
-    from hydrotele.cli.console import catch_first_interrupt, print_json, stderr_console, stdout_console
-    from hydrotele.cli.run_command import print_summary, write_run
-    from hydrotele.core.output import atomic_folder, check_output_folder
+    from hydrotele.cli.console import catch_first_interrupt, stderr_console
+    from hydrotele.cli.run_command import write_and_print_run
+    from hydrotele.core.output import check_output_folder
     from hydrotele.run.live_server import serve_scenario
     from hydrotele.scenario.scenario import load_scenario
     from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
@@ -76,11 +76,6 @@ def serve_to_folder(
     check_output_folder(target, "run")
     with catch_first_interrupt() as interrupted:
         result = serve_scenario(scenario, options, lambda text: stderr_console.print(text, soft_wrap=True), interrupted)
-    with atomic_folder(target, "run") as folder:
-        write_run(result, folder, review)
-    if as_json:
-        print_json({**result.summary, "folder": str(target)})
-    else:
-        print_summary(result.summary)
-        stdout_console.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats this run")
-    return target
+    return write_and_print_run(
+        result, target, review, as_json, "; hydrotele run with its scenario.yaml repeats this run"
+    )
