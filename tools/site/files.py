@@ -1,0 +1,321 @@
+"""Pages that list every key of the files that hydrotele reads, from the classes that validate them."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from hydrotele.calibrate.hybrid_measurement import MeasurementSpec
+from hydrotele.calibrate.scara_calibration import ScaraSpec
+from hydrotele.core.datafile import ANGULAR_FREQUENCY_KEYS, MAX_MAGNITUDE
+from hydrotele.core.units import KEY_SUFFIXES
+from hydrotele.identify.mechanism import ColumnMapping
+from hydrotele.kinematics.hybrid_robot import HybridSpec
+from hydrotele.kinematics.serial_robot_files import _RobotSpec
+from hydrotele.machine.joystick import Joystick
+from hydrotele.machine.log_columns import _LogColumnsFile
+from hydrotele.machine.machine import Machine
+from hydrotele.run.devices import Script
+from hydrotele.run.sweep_file import Sweep
+from hydrotele.scenario.scenario import Scenario
+from hydrotele.teleop.case_file import TeleopCaseFile
+from hydrotele.teleop.operator_parameters import OperatorFile
+
+
+class FileKind(NamedTuple):
+    """A kind of file: its title, the class of its content, and what it is for.
+
+    `set_by_program` are the keys of the class that a file does not have.
+    """
+
+    title: str
+    model: type[BaseModel]
+    purpose: str
+    set_by_program: tuple[str, ...] = ()
+
+
+FILE_KINDS = {
+    "machine_yaml": FileKind(
+        "machine.yaml",
+        Machine,
+        "`machine.yaml` in the folder of a machine describes its links, drives, pumps and sensors. [Your machine and your logs]"
+        "(../bring_your_own.md) shows how to write one; `hydrotele validate FOLDER` checks it.\n\n"
+        "A file has two keys that the table below does not list. `extends: {machine: NAME, tool: NAME}` starts from another machine:"
+        " the file then contains only the differences. `tools` maps names of tools to sections (`links`, `axes`, `home`, ...) that are"
+        " added when the tool is mounted; `tool` is the tool that is mounted by default.",
+        ("folder", "removed_bodies"),
+    ),
+    "scenario_yaml": FileKind(
+        "scenario.yaml",
+        Scenario,
+        "A scenario file describes one simulated run. `hydrotele run FILE.yaml` simulates it; `--set KEY=VALUE` replaces a value."
+        " [Simulate](../simulate.md) shows examples.",
+        ("folder",),
+    ),
+    "sweep_yaml": FileKind(
+        "Sweep files",
+        Sweep,
+        "`hydrotele sweep FILE.yaml` runs variations of one scenario. [Simulate](../simulate.md) shows examples.",
+    ),
+    "teleop_case_yaml": FileKind(
+        "Teleoperation cases",
+        TeleopCaseFile,
+        "`hydrotele analyse teleop FILE.yaml` analyses a linear teleoperator that such a file describes."
+        " [Teleoperate](../teleoperate.md) explains the analysis.",
+    ),
+    "joystick_yaml": FileKind(
+        "joystick.yaml",
+        Joystick,
+        "A joystick file describes a magnetically levitated joystick: workspace, coils, sensing and gains. A teleoperated scenario"
+        " names it in `pilot.joystick`.",
+        ("folder",),
+    ),
+    "operator_yaml": FileKind(
+        "Operator files",
+        OperatorFile,
+        "Parameters of the simulated operator. `hydrotele identify-operator` writes such a file, and a scenario names it in"
+        " `pilot.perception.file`.",
+    ),
+    "log_columns_yaml": FileKind(
+        "log_columns.yaml",
+        _LogColumnsFile,
+        "The file maps columns of foreign logs, or fields of messages, to channels. It lies in the folder of the logs or is given with"
+        " `hydrotele import --mapping FILE`; a machine file may have the same key. [Logs](../logs.md) describes the formats.\n\n"
+        "An entry is a text (`angle.boom`, `-command.boom` for the opposite sign, `angle.boom [deg]` with the unit, `none` to skip the"
+        " column) or a mapping with the keys below. The value of the channel is `sign * scale * (column - minus) + offset`.",
+    ),
+    "columns_yaml": FileKind(
+        "columns.yaml",
+        ColumnMapping,
+        "The file maps log columns to joints and drives of an MJCF mechanism, for `hydrotele gap --mjcf` and `hydrotele identify --mjcf`."
+        " [Any mechanism](../any_mechanism.md) shows an example.",
+    ),
+    "device_script_yaml": FileKind(
+        "Device scripts",
+        Script,
+        "`hydrotele drive --device scripted:FILE.yaml` moves the joystick as the file states, without a person.",
+    ),
+    "robot_yaml": FileKind(
+        "robot.yaml",
+        _RobotSpec,
+        "The nominal geometry of a serial robot for `hydrotele calibrate mukca`. [Calibrate](../calibration.md) shows an example.",
+    ),
+    "hybrid_yaml": FileKind(
+        "Serial-parallel robots",
+        HybridSpec,
+        "The geometry of a serial-parallel robot for `hydrotele calibrate hybrid`. [Calibrating a serial-parallel robot]"
+        "(../hybrid_calibration.md) shows an example.",
+    ),
+    "measurement_yaml": FileKind(
+        "measurement.yaml",
+        MeasurementSpec,
+        "What was measured in a calibration of a serial-parallel robot, for `hydrotele calibrate hybrid`.",
+    ),
+    "scara_yaml": FileKind(
+        "SCARA robots",
+        ScaraSpec,
+        "The nominal geometry of a SCARA robot for `hydrotele calibrate scara`.",
+    ),
+}
+
+SENTENCE = re.compile(r"(?<=[.:;])\s+(?=[A-Z`0-9])")
+UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
+NOT_UNITS = ("low", "values", "mean", "x", "command_unit")
+
+
+class Key(NamedTuple):
+    """One key of a section: its name, unit, type, default, valid values and description (Markdown)."""
+
+    name: str
+    unit: str
+    type: str
+    default: str
+    values: str
+    description: str
+
+
+class Section(NamedTuple):
+    """A mapping inside a file: class name, key paths, text and keys."""
+
+    name: str
+    paths: tuple[str, ...]
+    text: str
+    keys: tuple[Key, ...]
+
+
+def read_sections(kind: FileKind) -> list[Section]:
+    """Return the sections of a kind of file, outermost first."""
+    schema = kind.model.model_json_schema()
+    definitions = {**schema.get("$defs", {}), kind.model.__name__: schema}
+    paths: dict[str, list[str]] = {kind.model.__name__: [""]}
+    waiting = [kind.model.__name__]
+    for name in waiting:  # the list grows during the loop
+        for key, facts in definitions[name].get("properties", {}).items():
+            if name == kind.model.__name__ and key in kind.set_by_program:
+                continue
+            for path, inner in _find_sections(facts, key):
+                if inner == name:
+                    continue
+                full = f"{paths[name][0]}.{path}" if paths[name][0] else path
+                if inner not in paths:
+                    paths[inner] = []
+                    waiting.append(inner)
+                if full not in paths[inner]:
+                    paths[inner].append(full)
+    skipped = {kind.model.__name__: kind.set_by_program}
+    return [_make_section(name, definitions[name], tuple(paths[name]), skipped.get(name, ())) for name in waiting]
+
+
+def _find_sections(facts: dict[str, Any], path: str) -> Iterator[tuple[str, str]]:
+    """Yield (key path, class name) of every class that the value of a key may have."""
+    if "$ref" in facts:
+        yield path, facts["$ref"].rpartition("/")[2]
+    for option in (*facts.get("anyOf", ()), *facts.get("oneOf", ()), *facts.get("allOf", ())):
+        yield from _find_sections(option, path)
+    if isinstance(facts.get("additionalProperties"), dict):
+        yield from _find_sections(facts["additionalProperties"], f"{path}.NAME")
+    if isinstance(facts.get("items"), dict):
+        yield from _find_sections(facts["items"], f"{path}[]")
+    for option in facts.get("prefixItems", ()):
+        yield from _find_sections(option, f"{path}[]")
+
+
+def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], skipped: tuple[str, ...]) -> Section:
+    text = schema.get("description", "").strip()
+    names = [key for key in schema.get("properties", {}) if key not in skipped]
+    summary, _, rest = text.partition("\n\n")
+    sentences = [" ".join(s.split()) for s in SENTENCE.split(rest)] if rest else []
+    sentences = [s for s in sentences if s]
+    described: dict[str, list[str]] = {key: [] for key in names}
+    prose = [" ".join(summary.split())]
+    for sentence in sentences:
+        mentioned = [key for key in names if _mentions(sentence, key)]
+        for key in mentioned:
+            described[key].append(sentence)
+        if not mentioned:
+            prose.append(sentence)
+    required = schema.get("required", ())
+    keys = tuple(
+        Key(
+            key,
+            find_unit(key, text, facts),
+            _describe_type(facts),
+            "required" if key in required else _describe_default(facts),
+            _describe_values(facts),
+            " ".join(described[key]),
+        )
+        for key, facts in schema.get("properties", {}).items()
+        if key in names
+    )
+    return Section(name, paths, " ".join(prose), keys)
+
+
+def _mentions(sentence: str, key: str) -> bool:
+    return re.search(rf"`{key}[`:]", sentence) is not None
+
+
+def find_unit(key: str, text: str, facts: dict[str, Any]) -> str:
+    """Return the unit [in Markdown] that a docstring states behind the name of a key; empty without one.
+
+    Several names can share one unit: "`air_head` and `air_rod` [m^3]".
+    """
+    if not _is_numeric(facts):
+        return ""
+    more = r"(?:(?:,| and|, and)\s+`\w+`)*"
+    match = re.search(rf"`?\b{key}\b`?{more}\s+{UNIT}", " ".join(text.split()))
+    if not match or match["unit"] in NOT_UNITS:
+        return ""
+    return " or ".join(u for u in (match["unit"], match["other"]) if u)
+
+
+def _is_numeric(facts: dict[str, Any]) -> bool:
+    text = json.dumps(facts)
+    return '"number"' in text
+
+
+def _describe_type(facts: dict[str, Any]) -> str:
+    if "$ref" in facts:
+        name = facts["$ref"].rpartition("/")[2]
+        return f"[{name}](#{name.lower()})"
+    options = facts.get("anyOf") or facts.get("oneOf") or facts.get("allOf")
+    if options:
+        names = [_describe_type(option) for option in options if option.get("type") != "null"]
+        return " or ".join(dict.fromkeys(names))
+    if "const" in facts or "enum" in facts:
+        return "choice"
+    kind = facts.get("type")
+    if kind == "object":
+        inner = facts.get("additionalProperties")
+        return f"mapping of names to {_describe_type(inner)}" if isinstance(inner, dict) else "mapping"
+    if kind == "array":
+        if "prefixItems" in facts:
+            kinds = [_describe_type(item) for item in facts["prefixItems"]]
+            return f"{len(kinds)} {kinds[0]}s" if len(set(kinds)) == 1 else f"list of {', '.join(kinds)}"
+        return f"list of {_describe_type(facts.get('items', {}))}"
+    names = {"number": "number", "integer": "integer", "boolean": "true or false", "string": "text"}
+    return names.get(kind or "", "any value")
+
+
+def _describe_default(facts: dict[str, Any]) -> str:
+    default = facts.get("default")
+    if default is None:
+        return "none"
+    if isinstance(default, dict) and default:
+        return "its defaults"
+    return f"`{json.dumps(default)}`"
+
+
+def _describe_values(facts: dict[str, Any]) -> str:
+    """Return the valid values of a key: choices or limits, empty without any."""
+    parts = []
+    for option in (facts, *facts.get("anyOf", ()), *facts.get("oneOf", ())):
+        if "const" in option:
+            parts.append(f"`{json.dumps(option['const'])}`")
+        parts += [f"`{json.dumps(value)}`".replace('"', "") for value in option.get("enum", ())]
+        limits = []
+        for name, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤")):
+            if name in option and abs(option[name]) < MAX_MAGNITUDE:
+                limits.append(f"{sign} {option[name]:g}")
+        if limits:
+            parts.append(", ".join(limits))
+        for name, words in (("minItems", "at least"), ("maxItems", "at most")):
+            if name in option and "prefixItems" not in option:
+                parts.append(f"{words} {option[name]} entries")
+        item = option.get("items") or option.get("additionalProperties")
+        if isinstance(item, dict) and (inner := _describe_values(item)):
+            parts.append(f"each {inner}")
+        firsts = option.get("prefixItems", ())
+        if firsts and (inner := _describe_values(firsts[0])):
+            parts.append(f"each {inner}")
+    return "; ".join(dict.fromkeys(parts))
+
+
+def format_page(kind: FileKind) -> str:
+    """Return the page of a kind of file."""
+    suffixes = ", ".join(f"`{suffix}`" for suffix in KEY_SUFFIXES)
+    parts = [
+        f"# {kind.title}",
+        kind.purpose,
+        f"Values are in SI units and angles in radians. A key may have a unit as a suffix instead ({suffixes}), such as"
+        f" `relief_pressure_bar: 280`; for `{ANGULAR_FREQUENCY_KEYS[0]}` the suffix `_hz` stands for 2π rad/s.",
+    ]
+    for section in read_sections(kind):
+        outermost = section.paths == ("",)
+        parts.append(f"## {'Keys of the file' if outermost else section.name}")
+        if not outermost:
+            shown = [f"`{path}`" for path in section.paths[:4]]
+            parts.append(f"At {', '.join(shown)}{' and others' if len(section.paths) > 4 else ''}.")
+        parts.append(section.text)
+        rows = ["| key | unit | type | default | values | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+        for key in section.keys:
+            cells = (f"`{key.name}`", key.unit, key.type, key.default, key.values, key.description)
+            rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        parts.append("\n".join(rows))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def list_pages() -> dict[str, str]:
+    """Return {path of the page: its text} of all kinds of files."""
+    return {f"files/{name}.md": format_page(kind).replace("](../", "](../../") for name, kind in FILE_KINDS.items()}
