@@ -10,6 +10,8 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT))
 
+import pydantic  # noqa: E402
+
 import hydrotele  # noqa: E402
 
 project = "hydrotele"
@@ -25,6 +27,8 @@ extensions = [
     "sphinx_copybutton",
 ]
 exclude_patterns = ["_build", "**/.ipynb_checkpoints"]
+smartquotes = False  # options such as --out keep both hyphens
+default_role = "code"  # names in docstrings
 # Examples of other languages and of output have no language.
 highlight_language = "none"
 
@@ -112,6 +116,12 @@ def rewrite_links(app, docname: str, source: list[str]) -> None:
     source[0] = LINK.sub(rewrite, source[0])
 
 
+def shorten_signature(app, what, name, value, options, signature, returned):
+    """Return the signature of a class of a file without its keys, which have their own page."""
+    return ("(**keys)", "") if what == "class" and issubclass(value, pydantic.BaseModel) else None
+
+
 def setup(app) -> None:
-    """Register the rewriting of links."""
+    """Register the rewriting of links and signatures."""
     app.connect("source-read", rewrite_links)
+    app.connect("autodoc-process-signature", shorten_signature)

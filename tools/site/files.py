@@ -1,10 +1,13 @@
 """Pages that list every key of the files that hydrotele reads, from the classes that validate them."""
 
+import inspect
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
 from pydantic import BaseModel
 
 from hydrotele.calibrate.hybrid_measurement import MeasurementSpec
@@ -21,7 +24,7 @@ from hydrotele.run.devices import Script
 from hydrotele.run.sweep_file import Sweep
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.teleop.case_file import TeleopCaseFile
-from hydrotele.teleop.operator_parameters import OperatorFile
+from hydrotele.teleop.operator_parameters import Operator, OperatorFile
 
 
 class FileKind(NamedTuple):
@@ -120,8 +123,14 @@ FILE_KINDS = {
     ),
 }
 
-SENTENCE = re.compile(r"(?<=[.:;])\s+(?=[A-Z`0-9])")
+SENTENCE = re.compile(r"(?<=[.:])\s+(?=[A-Z`])")
+ATTRIBUTE = re.compile(r"^ {4}(?P<key>\w+): (?P<text>.*(?:\n {8}.*)*)", re.M)
+KEYS: dict[str, dict[str, str]] = yaml.safe_load(Path(__file__).with_name("keys.yaml").read_text(encoding="utf-8"))
+"""Class name -> key -> meaning with its unit, for keys that no docstring describes; `any` holds those of every class."""
+MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc__ or "").partition("\n\n")[2]}
+"""Class name -> text that also describes its keys."""
 UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
+STATED_UNIT = re.compile(rf"\s*{UNIT.replace('?P<unit>', '').replace('?P<other>', '')}")
 NOT_UNITS = ("low", "values", "mean", "x", "command_unit")
 
 
@@ -174,57 +183,86 @@ def _find_sections(facts: dict[str, Any], path: str) -> Iterator[tuple[str, str]
         yield path, facts["$ref"].rpartition("/")[2]
     for option in (*facts.get("anyOf", ()), *facts.get("oneOf", ()), *facts.get("allOf", ())):
         yield from _find_sections(option, path)
-    if isinstance(facts.get("additionalProperties"), dict):
-        yield from _find_sections(facts["additionalProperties"], f"{path}.NAME")
+    if inner := _find_entry(facts):
+        yield from _find_sections(inner, f"{path}.NAME")
     if isinstance(facts.get("items"), dict):
         yield from _find_sections(facts["items"], f"{path}[]")
     for option in facts.get("prefixItems", ()):
         yield from _find_sections(option, f"{path}[]")
 
 
+def _find_entry(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the schema of the entries of a mapping; empty for other values."""
+    for entry in (facts.get("additionalProperties"), *facts.get("patternProperties", {}).values()):
+        if isinstance(entry, dict):
+            return entry
+    return {}
+
+
 def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], skipped: tuple[str, ...]) -> Section:
     text = schema.get("description", "").strip()
-    names = [key for key in schema.get("properties", {}) if key not in skipped]
-    summary, _, rest = text.partition("\n\n")
-    sentences = [" ".join(s.split()) for s in SENTENCE.split(rest)] if rest else []
-    sentences = [s for s in sentences if s]
-    described: dict[str, list[str]] = {key: [] for key in names}
-    prose = [" ".join(summary.split())]
-    for sentence in sentences:
-        mentioned = [key for key in names if _mentions(sentence, key)]
-        for key in mentioned:
-            described[key].append(sentence)
-        if not mentioned:
-            prose.append(sentence)
+    properties = {key: facts for key, facts in schema.get("properties", {}).items() if key not in skipped}
+    described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), tuple(properties))
+    for key, entry in (KEYS.get("any", {}) | KEYS.get(name, {})).items():
+        if key in properties and (key not in described or key in KEYS.get(name, {})):
+            described[key] = entry
     required = schema.get("required", ())
     keys = tuple(
         Key(
             key,
-            find_unit(key, text, facts),
+            find_unit(key, described.get(key, ""), text) if _is_numeric(facts) else "",
             _describe_type(facts),
-            "required" if key in required else _describe_default(facts),
+            "" if key in required else _describe_default(facts),
             _describe_values(facts),
-            " ".join(described[key]),
+            described.get(key, ""),
         )
-        for key, facts in schema.get("properties", {}).items()
-        if key in names
+        for key, facts in properties.items()
     )
-    return Section(name, paths, " ".join(prose), keys)
+    return Section(name, paths, prose, keys)
 
 
-def _mentions(sentence: str, key: str) -> bool:
-    return re.search(rf"`{key}[`:]", sentence) is not None
+def split_docstring(text: str, keys: tuple[str, ...]) -> tuple[dict[str, str], str]:
+    """Split a docstring into the meaning of each key, and the remaining text.
+
+    A key is described by its line below `Attributes:`, by its item of a list, or by the sentences that name it in
+    backticks. The summary is part of the remaining text.
+    """
+    summary, _, rest = text.partition("\n\n")
+    described: dict[str, str] = {}
+    prose = [" ".join(summary.split())]
+    rest, _, attributes = rest.partition("Attributes:\n")
+    for match in ATTRIBUTE.finditer(attributes):
+        if match["key"] in keys:
+            described[match["key"]] = " ".join(match["text"].split())
+    for block in re.split(r"\n\s*\n|\n(?=- )", rest):
+        words = " ".join(block.split())
+        names, colon, meaning = words.removeprefix("- ").partition(":")
+        if words.startswith("- ") and colon and any(f"`{key}`" in names for key in keys):
+            for key in keys:
+                if f"`{key}`" in names:
+                    unit = re.search(r"\[.*", names)
+                    described.setdefault(key, f"{unit[0] + ' ' if unit else ''}{meaning.strip()}")
+            continue
+        if words.startswith("- "):
+            prose.append("\n" + words)
+            continue
+        for sentence in filter(None, SENTENCE.split(words)):
+            mentioned = [key for key in keys if re.search(rf"`{key}[`:]", sentence)]
+            for key in mentioned:
+                described[key] = f"{described[key]} {sentence}" if key in described else sentence
+            if not mentioned:
+                prose.append(sentence)
+    return described, "\n".join(prose)
 
 
-def find_unit(key: str, text: str, facts: dict[str, Any]) -> str:
-    """Return the unit [in Markdown] that a docstring states behind the name of a key; empty without one.
+def find_unit(key: str, meaning: str, text: str) -> str:
+    """Return the unit that the meaning of a key contains, or that a docstring states behind its name; empty without one.
 
     Several names can share one unit: "`air_head` and `air_rod` [m^3]".
     """
-    if not _is_numeric(facts):
-        return ""
     more = r"(?:(?:,| and|, and)\s+`\w+`)*"
-    match = re.search(rf"`?\b{key}\b`?{more}\s+{UNIT}", " ".join(text.split()))
+    match = None if f"`{key}`" in meaning else re.search(UNIT, meaning)
+    match = match or re.search(rf"`?\b{key}\b`?{more}\s+{UNIT}", " ".join(f"{meaning} {text}".split()))
     if not match or match["unit"] in NOT_UNITS:
         return ""
     return " or ".join(u for u in (match["unit"], match["other"]) if u)
@@ -247,8 +285,8 @@ def _describe_type(facts: dict[str, Any]) -> str:
         return "choice"
     kind = facts.get("type")
     if kind == "object":
-        inner = facts.get("additionalProperties")
-        return f"mapping of names to {_describe_type(inner)}" if isinstance(inner, dict) else "mapping"
+        inner = _find_entry(facts)
+        return f"mapping of names to {_describe_type(inner)}" if inner else "mapping"
     if kind == "array":
         if "prefixItems" in facts:
             kinds = [_describe_type(item) for item in facts["prefixItems"]]
@@ -260,8 +298,10 @@ def _describe_type(facts: dict[str, Any]) -> str:
 
 def _describe_default(facts: dict[str, Any]) -> str:
     default = facts.get("default")
-    if default is None:
+    if default in (None, [], {}, ""):
         return "none"
+    if isinstance(default, float):
+        return f"`{default:g}`"
     if isinstance(default, dict) and default:
         return "its defaults"
     return f"`{json.dumps(default)}`"
@@ -283,13 +323,13 @@ def _describe_values(facts: dict[str, Any]) -> str:
         for name, words in (("minItems", "at least"), ("maxItems", "at most")):
             if name in option and "prefixItems" not in option:
                 parts.append(f"{words} {option[name]} entries")
-        item = option.get("items") or option.get("additionalProperties")
-        if isinstance(item, dict) and (inner := _describe_values(item)):
+        item = option.get("items") or _find_entry(option)
+        if item and (inner := _describe_values(item)):
             parts.append(f"each {inner}")
         firsts = option.get("prefixItems", ())
         if firsts and (inner := _describe_values(firsts[0])):
             parts.append(f"each {inner}")
-    return "; ".join(dict.fromkeys(parts))
+    return " or ".join(dict.fromkeys(parts))
 
 
 def format_page(kind: FileKind) -> str:
@@ -308,12 +348,25 @@ def format_page(kind: FileKind) -> str:
             shown = [f"`{path}`" for path in section.paths[:4]]
             parts.append(f"At {', '.join(shown)}{' and others' if len(section.paths) > 4 else ''}.")
         parts.append(section.text)
-        rows = ["| key | unit | type | default | values | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+        rows = ["| key | value | meaning |", "| --- | --- | --- |"]
         for key in section.keys:
-            cells = (f"`{key.name}`", key.unit, key.type, key.default, key.values, key.description)
-            rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+            meaning = key.description if f"`{key.name}`" in key.description else STATED_UNIT.sub("", key.description)
+            rows.append(f"| `{key.name}` | {format_value(key)} | {escape(meaning)} |")
         parts.append("\n".join(rows))
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def format_value(key: Key) -> str:
+    """Return type, unit, valid values and default of a key as the text of a table cell."""
+    unit = f" [{key.unit.replace(' or ', '] or [')}]" if key.unit else ""
+    kind = key.values if key.type == "choice" else f"{key.type}{unit}{f', {key.values}' if key.values else ''}"
+    default = "" if key.default in ("none", "") else f"; default {key.default}"
+    return escape(f"{kind}{default}{'' if key.default else '; **required**'}")
+
+
+def escape(text: str) -> str:
+    """Return a text for a cell of a Markdown table."""
+    return text.replace("|", "\\|").strip()
 
 
 def list_pages() -> dict[str, str]:

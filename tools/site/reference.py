@@ -11,7 +11,8 @@ import os
 import re
 from pathlib import Path
 
-from tools.site import api, channels, commands, files
+from tools.site import api, channels, commands, effects, files
+from tools.site.effect_pictures import write_pictures
 
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\]\((?!https?:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
@@ -26,6 +27,7 @@ Everything on these pages is generated from the program.
 
 files/index
 channels
+effects/index
 commands/index
 python
 machines/index
@@ -83,10 +85,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "reference")
     folder = parser.parse_args().out
     pages = {"index.md": INDEX}
-    for module in (files, channels, commands, api):
+    for module in (files, channels, effects, commands, api):
         pages |= module.list_pages()
     pages |= list_file_index() | list_repository_pages(folder)
-    print(f"reference: {write_pages(pages, folder)} pages in {folder}")
+    count = write_pages(pages, folder)
+    drawn = write_pictures(folder / "effects")
+    print(f"reference: {count} pages, {drawn} new pictures in {folder}")
 
 
 if __name__ == "__main__":
