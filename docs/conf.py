@@ -76,8 +76,8 @@ copybutton_exclude = ".linenos, .gp, .go"
 # MathJax in one file, so that equations need no network.
 _mathjax = importlib.util.find_spec("sphinx-mathjax-offline")
 if _mathjax and _mathjax.submodule_search_locations:
-    html_static_path.append(str(Path(_mathjax.submodule_search_locations[0], "static", "mathjax", "tex-svg.js")))
-    mathjax_path = "tex-svg.js"
+    html_static_path.append(str(Path(_mathjax.submodule_search_locations[0], "static", "mathjax", "tex-svg-full.js")))
+    mathjax_path = "tex-svg-full.js"
 
 linkcheck_anchors = False
 

@@ -11,8 +11,8 @@ TOPICS = {
     "Find the gap": ("find_gap", "Gap", "gap_document", "write_patch"),
     "Identify": ("identify_dynamics", "identify_gravity", "endpoint_force_of_log"),
     "Control and learning": (
-        "make_controller", "PythonTask", "TaskState", "ObservationField", "draw_uniform", "draw_uniform_between", "compiled",
-        "PilotState", "allow_policy",
+        "make_controller", "PythonTask", "TaskState", "ObservationField", "draw_uniform", "draw_uniform_between",
+        "compiled", "PilotState", "allow_policy",
     ),
     "Importers": ("Importer", "make_recording", "Recording"),
     "Errors": ("InputError",),
@@ -44,7 +44,8 @@ def list_pages() -> dict[str, str]:
     parts = [
         "# Python API",
         "`import hydrotele` gives these names; each is imported when it is first used. Units are SI, angles in radians."
-        " [From Python](../api.md) is a short overview; [Custom effects](../effects.md) explains the names of `hydrotele.effects`.",
+        " [From Python](../api.md) is a short overview; [Custom effects](../effects.md) explains the names of"
+        " `hydrotele.effects`.",
     ]
     groups = {title: [f"hydrotele.{name}" for name in names] for title, names in TOPICS.items()}
     groups["Definition of effects"] = [f"hydrotele.effects.{name}" for name in EFFECT_NAMES]

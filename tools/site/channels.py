@@ -11,8 +11,9 @@ def format_page() -> str:
     units = "\n".join(f"| {unit} | {si} | {factor:.6g} |" for unit, (si, factor) in UNITS.items())
     return f"""# Log channels
 
-A channel is one column of a log. Its name is `kind.axis`, such as `angle.boom`, or a kind alone, such as `time`. Each value is a float64 in
-the SI unit of the table; where two units are listed, the first is that of rotary axes. [Logs of a real machine](../logs.md) describes files.
+A channel is one column of a log. Its name is `kind.axis`, such as `angle.boom`, or a kind alone, such as `time`.
+Each value is a float64 in the SI unit of the table; where two units are listed, the first is that of rotary axes.
+[Logs of a real machine](../logs.md) describes files.
 
 ## Measured channels
 

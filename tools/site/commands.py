@@ -23,7 +23,8 @@ def format_command(command: Any, words: str, level: int = 1) -> list[str]:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option" and not p.hidden]
     if not commands:
-        typed = [f"hydrotele {words}", *(_argument(p) for p in arguments), "[OPTIONS]" if options else ""]
+        needed = [f"{p.opts[0]} {_value_name(p)}" for p in options if p.required]
+        typed = [f"hydrotele {words}", *map(_argument, arguments), *needed, "[OPTIONS]" if options else ""]
         parts.append(f"```console\n{' '.join(word for word in typed if word)}\n```")
     if arguments:
         rows = [f"| `{_argument(p)}` | {_escape(p.help or '')} | {_default(p)} |" for p in arguments]

@@ -20,6 +20,7 @@ from hydrotele.scenario.scenario import PlantedEffect, Scenario, load_scenario
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
 
 SETTINGS_FILE = Path(__file__).with_name("effects.yaml")
 SETTINGS: dict[str, dict[str, Any]] = yaml.safe_load(SETTINGS_FILE.read_text(encoding="utf-8"))
@@ -27,24 +28,27 @@ SCENARIOS = {"excitation": 14.0, "eha_strokes": 8.0, "calibrate_boom": 40.0, "fe
 """Scenario -> simulated time [s]; the first whose machine can have an effect is used."""
 PREFERRED_AXES = ("stick", "piston", "boom")
 DEFAULT_CHANGE = 2.0  # standard deviations of the prior
+MIN_SHOWN_CHANGE = 1.0e-3  # of the range of a signal
 
 
 class Picture(NamedTuple):
-    """What the picture of an effect shows: scenario, location of the effect, parameter -> value."""
+    """Content of the picture of an effect: scenario, its changed values, location and parameters of the effect."""
 
     scenario: str
+    overrides: tuple[tuple[str, str], ...]
     location: str
     values: Mapping[str, float]
 
 
 @functools.cache
-def load_open_loop_scenario(name: str) -> tuple[Scenario, Machine]:
-    """Return a shipped scenario whose pilot repeats the commands of its run without added effects, and its machine."""
-    scenario = load_scenario(name, {"sensors": "ideal", "duration": f"{SCENARIOS[name]:g}", "effects": "[]"})
+def load_open_loop_scenario(name: str, overrides: tuple[tuple[str, str], ...]) -> Scenario:
+    """Return a shipped scenario without added effects whose pilot repeats the commands of its run."""
+    common = {"sensors": "ideal", "effects": "[]"} | ({"duration": f"{SCENARIOS[name]:g}"} if name in SCENARIOS else {})
+    scenario = load_scenario(name, common | dict(overrides))
     log = run_scenario(scenario).measured
     commands = {c.removeprefix("command."): log[c].tolist() for c in log.columns if c.startswith("command.")}
     pilot = TablePilot(kind="table", quantity="command", time=(log.time - log.time[0]).tolist(), columns=commands)
-    return scenario.model_copy(update={"pilot": pilot}), load_nominal_machine(scenario)
+    return scenario.model_copy(update={"pilot": pilot})
 
 
 @functools.cache
@@ -70,7 +74,7 @@ def choose_picture(name: str) -> Picture:
         for key, p in parameters.items()
         if not p.optional or key in change
     }
-    return Picture(scenario, location, values)
+    return Picture(scenario, tuple(setting.get("set", {}).items()), location, values)
 
 
 def _choose_location(effect: Effect, machine: Machine) -> str:
@@ -83,14 +87,14 @@ def _choose_location(effect: Effect, machine: Machine) -> str:
 
 
 @functools.cache
-def run_without_effect(scenario: str) -> Log:
+def run_without_effect(scenario: str, overrides: tuple[tuple[str, str], ...]) -> Log:
     """Return the log of the sensors in the run without the effect."""
-    return run_scenario(load_open_loop_scenario(scenario)[0]).measured
+    return run_scenario(load_open_loop_scenario(scenario, overrides)).measured
 
 
 def run_with_effect(name: str, picture: Picture) -> Log:
     """Return the log of the sensors in the run with the effect."""
-    scenario = load_open_loop_scenario(picture.scenario)[0]
+    scenario = load_open_loop_scenario(picture.scenario, picture.overrides)
     planted = PlantedEffect(name=name, location=picture.location, parameters=dict(picture.values))
     return run_scenario(scenario.model_copy(update={"effects": (planted,)})).measured
 
@@ -111,9 +115,17 @@ def list_channels(name: str, picture: Picture, log: Log) -> list[list[str]]:
     return [pressures, motion]
 
 
+def _widen_limits(panel: Axes, span: float) -> None:
+    """Make the vertical range of a panel at least as large as `span`, so that rounding errors are not enlarged."""
+    low, high = panel.get_ylim()
+    if high - low < span:
+        middle = round(0.5 * (low + high) / span) * span
+        panel.set_ylim(middle - span, middle + span)
+
+
 def draw_picture(name: str, picture: Picture, file: Path) -> None:
     """Simulate an effect and draw its signature: signals with and without it, and their difference."""
-    before, after = run_without_effect(picture.scenario), run_with_effect(name, picture)
+    before, after = run_without_effect(picture.scenario, picture.overrides), run_with_effect(name, picture)
     rows = list_channels(name, picture, before)
     figure, axes = plt.subplots(len(rows), 2, figsize=(9.0, 2.3 * len(rows)), sharex=True, squeeze=False)
     for (left, right), channels in zip(axes, rows, strict=True):
@@ -123,6 +135,8 @@ def draw_picture(name: str, picture: Picture, file: Path) -> None:
             left.plot(before.time, factor * before[channel], color=colour, alpha=0.45, linewidth=2.4)
             left.plot(after.time, factor * after[channel], color=colour, linewidth=1.0, label=channel)
             right.plot(after.time, factor * (after[channel] - before[channel]), color=colour, linewidth=1.0)
+        spans = [float(np.ptp(factor * before[channel])) for channel in channels]
+        _widen_limits(right, MIN_SHOWN_CHANGE * max(spans))
         left.set_ylabel(unit)
         left.legend(fontsize=7, loc="best")
     axes[0][0].set_title("without (wide, pale) and with the effect (thin)", fontsize=9)

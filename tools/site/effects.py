@@ -40,15 +40,18 @@ def format_page(effect: Effect) -> str:
         f"Locations on `{machine.name}`: {places}.",
         "" if not effect.mechanism or not forms else f"Other forms of this mechanism: {_links(forms)}.",
         "## Parameters",
-        f"Values for the location `{picture.location}` of `{machine.name}`. The typical deviation is the standard deviation of the prior in a"
+        f"Values for the location `{picture.location}` of `{machine.name}`. The typical deviation is the standard"
+        f" deviation of the prior in a"
         " gap search; smaller changes than the smallest relevant one are not reported.",
         "| parameter | unit | nominal | lowest | highest | typical deviation | smallest relevant change |\n"
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |\n" + "\n".join(rows),
         (inspect.getdoc(effect.parameters) or "").partition("\n\n")[2].replace("\n\n", "\n"),
         "## Signature",
-        f"Run `{picture.scenario}` with the commands of the run without the effect; {sizes}.",
+        f"Both runs of `{picture.scenario}` have the same commands. With the effect: {sizes}.",
         f"![Signals with and without {effect.name}]({effect.name}.png)",
-        f"```bash\nhydrotele run {picture.scenario} --set 'effects=[{{name: {effect.name}, location: {picture.location},"
+        "To add the effect to a run:",
+        f"```bash\nhydrotele run {picture.scenario} --set 'effects=[{{name: "
+        f"{effect.name}, location: {picture.location},"
         f" parameters: {{{given}}}}}]'\n```",
         f"Source: {setting['source']}.",
     ]
@@ -74,8 +77,10 @@ def list_pages() -> dict[str, str]:
     pages = {f"effects/{name}.md": format_page(effect) for name, effect in EFFECTS.items()}
     parts = [
         "# Effects",
-        "An effect is a physical property that a machine has and its model may omit. `hydrotele list effects` lists them;"
-        " [Custom effects](../../effects.md) shows how to write one. Each page has the equation, the parameters with their ranges, and a"
+        "An effect is a physical property that a machine has and its model may omit. `hydrotele list effects` lists"
+        " them;"
+        " [Custom effects](../../effects.md) shows how to write one. Each page has the equation, the parameters with"
+        " their ranges, and a"
         " picture of what the effect changes in pressures and motion.",
     ]
     for part, title in TITLES.items():

@@ -28,105 +28,40 @@ from hydrotele.teleop.operator_parameters import Operator, OperatorFile
 
 
 class FileKind(NamedTuple):
-    """A kind of file: its title, the class of its content, and what it is for.
+    """A kind of file: the class of its content, its title, and what it is for.
 
     `set_by_program` are the keys of the class that a file does not have.
     """
 
-    title: str
     model: type[BaseModel]
+    title: str
     purpose: str
     set_by_program: tuple[str, ...] = ()
 
 
-FILE_KINDS = {
-    "machine_yaml": FileKind(
-        "machine.yaml",
-        Machine,
-        "`machine.yaml` in the folder of a machine describes its links, drives, pumps and sensors. [Your machine and your logs]"
-        "(../bring_your_own.md) shows how to write one; `hydrotele validate FOLDER` checks it.\n\n"
-        "A file has two keys that the table below does not list. `extends: {machine: NAME, tool: NAME}` starts from another machine:"
-        " the file then contains only the differences. `tools` maps names of tools to sections (`links`, `axes`, `home`, ...) that are"
-        " added when the tool is mounted; `tool` is the tool that is mounted by default.",
-        ("folder", "removed_bodies"),
-    ),
-    "scenario_yaml": FileKind(
-        "scenario.yaml",
-        Scenario,
-        "A scenario file describes one simulated run. `hydrotele run FILE.yaml` simulates it; `--set KEY=VALUE` replaces a value."
-        " [Simulate](../simulate.md) shows examples.",
-        ("folder",),
-    ),
-    "sweep_yaml": FileKind(
-        "Sweep files",
-        Sweep,
-        "`hydrotele sweep FILE.yaml` runs variations of one scenario. [Simulate](../simulate.md) shows examples.",
-    ),
-    "teleop_case_yaml": FileKind(
-        "Teleoperation cases",
-        TeleopCaseFile,
-        "`hydrotele analyse teleop FILE.yaml` analyses a linear teleoperator that such a file describes."
-        " [Teleoperate](../teleoperate.md) explains the analysis.",
-    ),
-    "joystick_yaml": FileKind(
-        "joystick.yaml",
-        Joystick,
-        "A joystick file describes a magnetically levitated joystick: workspace, coils, sensing and gains. A teleoperated scenario"
-        " names it in `pilot.joystick`.",
-        ("folder",),
-    ),
-    "operator_yaml": FileKind(
-        "Operator files",
-        OperatorFile,
-        "Parameters of the simulated operator. `hydrotele identify-operator` writes such a file, and a scenario names it in"
-        " `pilot.perception.file`.",
-    ),
-    "log_columns_yaml": FileKind(
-        "log_columns.yaml",
-        _LogColumnsFile,
-        "The file maps columns of foreign logs, or fields of messages, to channels. It lies in the folder of the logs or is given with"
-        " `hydrotele import --mapping FILE`; a machine file may have the same key. [Logs](../logs.md) describes the formats.\n\n"
-        "An entry is a text (`angle.boom`, `-command.boom` for the opposite sign, `angle.boom [deg]` with the unit, `none` to skip the"
-        " column) or a mapping with the keys below. The value of the channel is `sign * scale * (column - minus) + offset`.",
-    ),
-    "columns_yaml": FileKind(
-        "columns.yaml",
-        ColumnMapping,
-        "The file maps log columns to joints and drives of an MJCF mechanism, for `hydrotele gap --mjcf` and `hydrotele identify --mjcf`."
-        " [Any mechanism](../any_mechanism.md) shows an example.",
-    ),
-    "device_script_yaml": FileKind(
-        "Device scripts",
-        Script,
-        "`hydrotele drive --device scripted:FILE.yaml` moves the joystick as the file states, without a person.",
-    ),
-    "robot_yaml": FileKind(
-        "robot.yaml",
-        _RobotSpec,
-        "The nominal geometry of a serial robot for `hydrotele calibrate mukca`. [Calibrate](../calibration.md) shows an example.",
-    ),
-    "hybrid_yaml": FileKind(
-        "Serial-parallel robots",
-        HybridSpec,
-        "The geometry of a serial-parallel robot for `hydrotele calibrate hybrid`. [Calibrating a serial-parallel robot]"
-        "(../hybrid_calibration.md) shows an example.",
-    ),
-    "measurement_yaml": FileKind(
-        "measurement.yaml",
-        MeasurementSpec,
-        "What was measured in a calibration of a serial-parallel robot, for `hydrotele calibrate hybrid`.",
-    ),
-    "scara_yaml": FileKind(
-        "SCARA robots",
-        ScaraSpec,
-        "The nominal geometry of a SCARA robot for `hydrotele calibrate scara`.",
-    ),
+MODELS: dict[str, type[BaseModel]] = {
+    "machine_yaml": Machine,
+    "scenario_yaml": Scenario,
+    "sweep_yaml": Sweep,
+    "teleop_case_yaml": TeleopCaseFile,
+    "joystick_yaml": Joystick,
+    "operator_yaml": OperatorFile,
+    "log_columns_yaml": _LogColumnsFile,
+    "columns_yaml": ColumnMapping,
+    "device_script_yaml": Script,
+    "robot_yaml": _RobotSpec,
+    "hybrid_yaml": HybridSpec,
+    "measurement_yaml": MeasurementSpec,
+    "scara_yaml": ScaraSpec,
 }
+"""Kind of file -> class of its content."""
+TEXTS: dict[str, dict[str, Any]] = yaml.safe_load(Path(__file__).with_name("files.yaml").read_text(encoding="utf-8"))
+FILE_KINDS = {name: FileKind(model=model, **TEXTS["files"][name]) for name, model in MODELS.items()}
+KEYS: dict[str, dict[str, str]] = TEXTS["keys"]
+"""Class name -> key -> its meaning with the unit, where no docstring has it; `any` holds keys of every class."""
 
 SENTENCE = re.compile(r"(?<=[.:])\s+(?=[A-Z`])")
 ATTRIBUTE = re.compile(r"^ {4}(?P<key>\w+): (?P<text>.*(?:\n {8}.*)*)", re.M)
-KEYS: dict[str, dict[str, str]] = yaml.safe_load(Path(__file__).with_name("keys.yaml").read_text(encoding="utf-8"))
-"""Class name -> key -> meaning with its unit, for keys that no docstring describes; `any` holds those of every class."""
 MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc__ or "").partition("\n\n")[2]}
 """Class name -> text that also describes its keys."""
 UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
@@ -256,7 +191,7 @@ def split_docstring(text: str, keys: tuple[str, ...]) -> tuple[dict[str, str], s
 
 
 def find_unit(key: str, meaning: str, text: str) -> str:
-    """Return the unit that the meaning of a key contains, or that a docstring states behind its name; empty without one.
+    """Return the unit in the meaning of a key, or that behind its name in a docstring; empty without one.
 
     Several names can share one unit: "`air_head` and `air_rod` [m^3]".
     """
@@ -337,7 +272,7 @@ def format_page(kind: FileKind) -> str:
     suffixes = ", ".join(f"`{suffix}`" for suffix in KEY_SUFFIXES)
     parts = [
         f"# {kind.title}",
-        kind.purpose,
+        kind.purpose.strip(),
         f"Values are in SI units and angles in radians. A key may have a unit as a suffix instead ({suffixes}), such as"
         f" `relief_pressure_bar: 280`; for `{ANGULAR_FREQUENCY_KEYS[0]}` the suffix `_hz` stands for 2π rad/s.",
     ]

@@ -2,8 +2,8 @@
 
     python -m tools.site.reference
 
-The pages are those of files and their keys, log channels, effects, commands, machines and the Python API. tools/docs calls this
-command before Sphinx. A page that has not changed keeps its time, so that Sphinx does not build it again.
+The pages are those of files and their keys, log channels, effects, commands, machines and the Python API. tools/docs
+calls this command before Sphinx. A page that has not changed keeps its time, so that Sphinx does not build it again.
 """
 
 import argparse
@@ -54,7 +54,8 @@ def list_repository_pages(folder: Path) -> dict[str, str]:
     pages = {page: copy_page(file, folder / page) for page, file in (readmes | named).items()}
     names = "\n".join(Path(page).stem for page in readmes)
     pages["machines/index.md"] = (
-        "# Machines\n\nModels that hydrotele contains, with the sources of their parameters. `hydrotele list machines` lists those that"
+        "# Machines\n\nModels that hydrotele contains, with the sources of their parameters. `hydrotele list"
+        " machines` lists those that"
         f" commands accept.\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
     )
     return pages
