@@ -2,9 +2,9 @@
 
     python -m tools.site.browser_check docs/_build/html --pictures shots index.html gap.html
 
-Broken are images that do not load, errors of scripts, and pages that scroll sideways. `--pictures` also writes a picture of
-each named page at both widths. The exit status is 1 where something is broken. Needs playwright and the Chromium of the
-system; --build needs the network where the extra `docs` is not installed.
+Broken are images that do not load, errors of scripts, and pages that scroll sideways. `--pictures` also writes a
+picture of each named page at both widths. The exit status is 1 where something is broken. Needs playwright and the
+Chromium of the system; --build needs the network where the extra `docs` is not installed.
 """
 
 import argparse
@@ -24,35 +24,37 @@ EQUATION_FAILURE = "window.MathJax?.startup?.promise?.then(() => '', error => St
 EXCESS_WIDTH = "document.documentElement.scrollWidth - window.innerWidth"
 
 
+def list_pages(folder: Path) -> list[Path]:
+    """Return the pages of a site, without those of its static files."""
+    return [f for f in sorted(folder.rglob("*.html")) if not f.relative_to(folder).as_posix().startswith("_")]
+
+
 def find_faults(folder: Path, pictures: Path | None = None, names: tuple[str, ...] = ()) -> Iterator[str]:
     """Yield one line for every fault of the pages of a site."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        for width, height in WIDTHS.items():
-            page = browser.new_page(viewport={"width": width, "height": height})
-            errors: list[Any] = []
-            page.on("pageerror", lambda error, errors=errors: errors.append(error))
-            page.on("requestfailed", lambda request, errors=errors: errors.append(f"{request.url} does not load"))
-            for file in sorted(folder.rglob("*.html")):
-                name = file.relative_to(folder).as_posix()
-                if name.startswith("_"):
-                    continue
-                page.goto(file.resolve().as_uri())
-                if failure := page.evaluate(EQUATION_FAILURE):
-                    errors.append(failure)
-                page.evaluate(LOAD_IMAGES)
-                page.wait_for_function(IMAGES_LOADED)
-                where = f"{name} at {width} pixels"
-                yield from (f"{where}: {str(error).splitlines()[0]}" for error in errors)
-                yield from (f"{where}: broken image {image}" for image in page.evaluate(BROKEN_IMAGES))
+        page = browser.new_page()
+        errors: list[Any] = []
+        page.on("pageerror", lambda error: errors.append(error))
+        page.on("requestfailed", lambda request: errors.append(f"{request.url} does not load"))
+        for file in list_pages(folder):
+            name = file.relative_to(folder).as_posix()
+            page.goto(file.resolve().as_uri())
+            if failure := page.evaluate(EQUATION_FAILURE):
+                errors.append(failure)
+            page.evaluate(LOAD_IMAGES)
+            page.wait_for_function(IMAGES_LOADED)
+            yield from (f"{name}: {str(error).splitlines()[0]}" for error in errors)
+            yield from (f"{name}: broken image {image}" for image in page.evaluate(BROKEN_IMAGES))
+            errors.clear()
+            for width, height in WIDTHS.items():
+                page.set_viewport_size({"width": width, "height": height})
                 if (excess := page.evaluate(EXCESS_WIDTH)) > 0:
-                    yield f"{where}: scrolls sideways by {excess} pixels"
-                errors.clear()
+                    yield f"{name} scrolls sideways by {excess} pixels at a width of {width}"
                 if pictures and name in names:
                     page.screenshot(path=pictures / f"{name.removesuffix('.html').replace('/', '_')}_{width}.png")
-            page.close()
         browser.close()
 
 
@@ -68,8 +70,7 @@ def main() -> int:
     if args.pictures:
         args.pictures.mkdir(parents=True, exist_ok=True)
     faults = list(find_faults(args.folder, args.pictures, tuple(args.names)))
-    pages = sum(1 for f in args.folder.rglob("*.html") if not f.relative_to(args.folder).as_posix().startswith("_"))
-    print("\n".join([*faults, f"{pages} pages, {len(faults)} faults"]))
+    print("\n".join([*faults, f"{len(list_pages(args.folder))} pages, {len(faults)} faults"]))
     return int(bool(faults))
 
 
