@@ -13,6 +13,7 @@ sys.path.insert(0, str(ROOT))
 import pydantic  # noqa: E402
 
 import hydrotele  # noqa: E402
+from tools.site.repository_pages import find_page  # noqa: E402
 
 project = "hydrotele"
 author = "The hydrotele authors"
@@ -83,22 +84,6 @@ linkcheck_anchors = False
 
 LINK = re.compile(r"\[(?P<text>[^\[\]]*)\]\((?P<up>(?:\.\./)+)(?P<path>[^)#\s]+?)/?(?P<anchor>#[^)\s]*)?\)")
 """A link that leaves the folder of its page upwards."""
-PAGES = {
-    "README.md": "/get_started.md",
-    "CHANGELOG.md": "/reference/changelog.md",
-    "CONTRIBUTING.md": "/reference/contributing.md",
-}
-"""Files of the repository outside docs/ -> their pages of the site."""
-
-
-def _find_page(file: Path) -> str | None:
-    """Return the page of the site that shows a file outside docs/, or None if there is none."""
-    path = file.relative_to(ROOT).as_posix()
-    if path in PAGES:
-        return PAGES[path]
-    if machine := re.fullmatch(r"models/(\w+)(/README\.md)?", path):
-        return f"/reference/machines/{machine[1]}.md"
-    return None
 
 
 def rewrite_links(app, docname: str, source: list[str]) -> None:
@@ -109,9 +94,9 @@ def rewrite_links(app, docname: str, source: list[str]) -> None:
         file = (folder / match["up"] / match["path"]).resolve()
         if not file.is_relative_to(ROOT) or file.is_relative_to(DOCS):
             return match[0]
-        if page := _find_page(file):
-            return f"[{match['text']}]({page}{match['anchor'] or ''})"
-        return match["text"] if file.is_dir() else match[0]
+        if page := find_page(file):
+            return f"[{match['text']}](/{page}{match['anchor'] or ''})"
+        return match["text"] if file.is_dir() or file.suffix == ".md" else match[0]
 
     source[0] = LINK.sub(rewrite, source[0])
 
@@ -122,6 +107,9 @@ def shorten_signature(app, what, name, value, options, signature, returned):
 
 
 def setup(app) -> None:
-    """Register the rewriting of links and signatures."""
+    """Register the rewriting of links and signatures, and the language of notebooks, which contain shell commands."""
+    from ipython_pygments_lexers import IPython3Lexer
+
+    app.add_lexer("python", IPython3Lexer)
     app.connect("source-read", rewrite_links)
     app.connect("autodoc-process-signature", shorten_signature)

@@ -170,11 +170,17 @@ def test_every_written_page_is_in_the_contents():
 def test_links_out_of_the_pages_lead_to_pages_of_the_site():
     rewrite_links = runpy.run_path(str(DOCS / "conf.py"))["rewrite_links"]
     app = SimpleNamespace(env=SimpleNamespace(doc2path=lambda name: DOCS / f"{name}.md"))
-    text = [
-        "[CAT](../../models/cat215/README.md#pins), [it](../../tools/plugin_example), [x](../gap.md), [y](../../LICENSE)"
-    ]
-    rewrite_links(app, "validation/eha", text)
-    assert text == ["[CAT](/reference/machines/cat215.md#pins), it, [x](../gap.md), [y](../../LICENSE)"]
+    links = {
+        "[a](../../models/cat215/README.md#pins)": "[a](/reference/machines/cat215.md#pins)",
+        "[b](../../tools/plugin_example)": "[b](/reference/plugin_example.md)",
+        "[c](../../tools/studies)": "c",
+        "[d](../gap.md)": "[d](../gap.md)",
+        "[e](../../LICENSE)": "[e](../../LICENSE)",
+    }
+    for before, after in links.items():
+        text = [before]
+        rewrite_links(app, "validation/eha", text)
+        assert text == [after]
 
 
 def test_links_of_copied_pages_stay_valid():

@@ -13,10 +13,9 @@ from pathlib import Path
 
 from tools.site import api, channels, commands, effects, files
 from tools.site.effect_pictures import write_pictures
+from tools.site.repository_pages import PAGES, ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"\]\((?!https?:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
-REPOSITORY_PAGES = {"changelog.md": "CHANGELOG.md", "contributing.md": "CONTRIBUTING.md"}
 
 INDEX = """# Reference
 
@@ -31,6 +30,8 @@ effects/index
 commands/index
 python
 machines/index
+plugin_example
+tools
 changelog
 contributing
 ```
@@ -49,10 +50,8 @@ def copy_page(file: Path, page: Path) -> str:
 
 def list_repository_pages(folder: Path) -> dict[str, str]:
     """Return {path of the page: its text} of the machines' READMEs and of pages in the root of the repository."""
-    readmes = {f"machines/{f.parent.name}.md": f for f in sorted(ROOT.glob("models/*/README.md"))}
-    named = {page: ROOT / file for page, file in REPOSITORY_PAGES.items()}
-    pages = {page: copy_page(file, folder / page) for page, file in (readmes | named).items()}
-    names = "\n".join(Path(page).stem for page in readmes)
+    pages = {page: copy_page(ROOT / file, folder / page) for file, page in PAGES.items()}
+    names = "\n".join(Path(page).stem for page in pages if page.startswith("machines/"))
     pages["machines/index.md"] = (
         "# Machines\n\nModels that hydrotele contains, with the sources of their parameters. `hydrotele list"
         " machines` lists those that"
