@@ -29,7 +29,7 @@ def sections() -> dict[str, list[str]]:
     return {part.splitlines()[0]: LINE.findall(part) for part in parts}
 
 
-@pytest.mark.parametrize("folder", ["studies", "validation", "release"])
+@pytest.mark.parametrize("folder", ["studies", "validation", "release", "site"])
 def test_every_script_is_listed_once(folder, sections):
     assert sorted(sections[f"{folder}/"]) == sorted(scripts(TOOLS / folder))
 

@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 ALLOWED = Path(__file__).with_name("english_allowed.tsv")
+GENERATED_FOLDERS = ("docs/_build", "docs/reference")  # by tools/docs, from texts that are checked
 MAX_SENTENCE_WORDS = 32
 MIN_MESSAGE_WORDS = 4
 
@@ -181,6 +182,8 @@ def list_files(root: Path) -> list[Path]:
     pages = [root / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
     for folder in ("docs", "models", "tools"):
         pages += sorted((root / folder).rglob("*.md"))
+    generated = [root / folder for folder in GENERATED_FOLDERS]
+    pages = [page for page in pages if not any(page.is_relative_to(folder) for folder in generated)]
     package = root / "hydrotele"
     return [
         *filter(Path.is_file, pages),
