@@ -1,15 +1,15 @@
 """Run the code cells of a MyST notebook in the current folder: python run_notebook.py NOTEBOOK [--small JSON].
 
-Needs neither Jupyter nor IPython. Commands after `!` that begin with `hydrotele` run in this process, others in a shell; their
-exit status must be 0. With `--small`, the cell tagged `parameters` is replaced by the given values, and cells tagged `slow` or
-`learn` are left out. A cell tagged `raises-exception` must fail.
+Needs neither Jupyter nor IPython. Commands after `!` that begin with `hydrotele` run in this process,
+others in a shell; their exit status must be 0. With `--small`, the cell tagged `parameters` is replaced
+by the given values, and cells tagged `slow` or `learn` are left out. A cell tagged `raises-exception`
+must fail.
 """
 
 import json
 import re
 import subprocess
 import sys
-import types
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,6 +40,7 @@ def run_cell(code: str, names: dict) -> None:
         line, _, text = code.partition("\n")
         Path(line.split()[1]).write_text(text, encoding="utf-8")
         return
+    code = code.replace("from IPython.display import Image\n", "")
     exec(COMMAND.sub(lambda match: f"{match[1]}_run_command({match[2]!r})", code), names)
 
 
@@ -69,11 +70,7 @@ def run_notebook(path: Path, small: dict | None) -> None:
     import matplotlib
 
     matplotlib.use("agg")
-    shell, display = types.ModuleType("IPython"), types.ModuleType("IPython.display")
-    shell.__dict__["get_ipython"] = lambda: None
-    display.__dict__["Image"] = lambda file, **options: Path(file).read_bytes()
-    sys.modules |= {"IPython": shell, "IPython.display": display}
-    names: dict = {"__name__": "notebook"}
+    names: dict = {"__name__": "notebook", "Image": lambda file, **options: Path(file).read_bytes()}
     names["_run_command"] = make_command_runner(names)
     for cell in read_cells(path):
         if small is not None and {"slow", "learn"} & set(cell.tags):

@@ -35,7 +35,9 @@ def record_logs(folder: Path) -> None:
     effect = f"[{{name: valve_deadband, location: slide, parameters: {{deadband: {DEADBAND}}}}}]"
     for run, commands in COMMANDS.items():
         times = list(range(len(commands)))
-        pilot = f"{{kind: table, quantity: command, interpolate: linear, time: {times}, columns: {{slide: {commands}}}}}"
+        pilot = (
+            f"{{kind: table, quantity: command, interpolate: linear, time: {times}, columns: {{slide: {commands}}}}}"
+        )
         keys = {"pilot": pilot, "effects": effect, "duration": "10", "control_rate": "200", "log_rate": "200"}
         ht.save_log(ht.run_scenario(ht.load_scenario("rig_steps", keys)).measured, folder / f"{run}.parquet")
 
@@ -70,9 +72,16 @@ def main() -> None:
         evidence.set_base(base)
         track = next(t for t in base.tracks if t.run.name == run.name)
         inputs = smoothed_inputs(track)
-        labels = {"force": "force [N]", "command": "command [1]", "flow_head": "head flow [m³/s]", "flow_rod": "rod flow [m³/s]"}
+        labels = {
+            "force": "force [N]",
+            "command": "command [1]",
+            "flow_head": "head flow [m³/s]",
+            "flow_rod": "rod flow [m³/s]",
+        }
         count = len(track.levels.inputs)
-        figure, axes = plt.subplots(count, 1, figsize=(8, 1.6 * count), sharex=True, layout="constrained", squeeze=False)
+        figure, axes = plt.subplots(
+            count, 1, figsize=(8, 1.6 * count), sharex=True, layout="constrained", squeeze=False
+        )
         for axis, item, values in zip(axes[:, 0], track.levels.inputs, inputs.T, strict=True):
             axis.plot(time, values)
             axis.set(ylabel=labels.get(item.balance, item.balance))
@@ -94,7 +103,9 @@ def main() -> None:
     for machine, label in ((data.machine, "given machine"), (corrected, "corrected machine")):
         errors = track_run(machine, data, data.heldout).whitened
         axis.hist(np.clip(errors[np.isfinite(errors)], -8, 8), bins, density=True, alpha=0.6, label=label)
-    axis.set(xlabel="prediction error / its standard deviation, held-out run", ylabel="density", yscale="log", ylim=(1e-4, 1))
+    axis.set(
+        xlabel="prediction error / its standard deviation, held-out run", ylabel="density", yscale="log", ylim=(1e-4, 1)
+    )
     axis.legend()
     save(figure, "4_held_out")
 
