@@ -99,7 +99,7 @@ def main() -> None:
 
     corrected = ht.apply_effect(data.machine, "valve_deadband", "slide", {"deadband": DEADBAND})
     figure, axis = plt.subplots(figsize=(8, 3.2), layout="constrained")
-    bins = np.linspace(-8, 8, 81)
+    bins = np.linspace(-8, 8, 81).tolist()
     for machine, label in ((data.machine, "given machine"), (corrected, "corrected machine")):
         errors = track_run(machine, data, data.heldout).whitened
         axis.hist(np.clip(errors[np.isfinite(errors)], -8, 8), bins, density=True, alpha=0.6, label=label)
