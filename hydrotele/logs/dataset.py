@@ -338,6 +338,28 @@ def _count_fit_rows(rows: RunRows) -> int:
     return max(int(np.searchsorted(passed, _FIT_FRACTION * passed[-1])), round(_MIN_FIT_FRACTION * n))
 
 
+def describe_resting_axes(split: Split, axes: Sequence[str]) -> tuple[str, ...]:
+    """Return a note on axes that the held-out run hardly commands, although the fitted runs do; none if it commands all.
+
+    Args:
+        split: the runs.
+        axes: names of the nu axes.
+    """
+
+    def activity(parts: Sequence[RunPart]) -> np.ndarray:
+        changes = sum(np.nansum(np.abs(np.diff(part.rows.command, axis=0)), axis=0) for part in parts)
+        return changes / sum(run_duration(part.rows) for part in parts)
+
+    fitted, held_out = activity(split.fit), activity([split.heldout])
+    idle = [axis for axis, a, b in zip(axes, fitted, held_out, strict=True) if b < _MIN_HELD_OUT_CHANGE * a]
+    if not idle:
+        return ()
+    return (
+        f"{split.heldout.name} hardly moves {', '.join(idle)}, which the fitted runs move: it cannot confirm effects on"
+        " these axes. Hold out a run that moves all axes.",
+    )
+
+
 _SIMULATOR_METADATA = ("initial_state",)  # metadata that only a simulator can know
 
 
@@ -641,7 +663,7 @@ def make_dataset(
             rows.reading, log, rows.valid, means,
         )  # fmt: skip
     judge = made.pop(parts.heldout.name)
-    notes += left
+    notes += [*left, *describe_resting_axes(parts, axes)]
     return Dataset(machine, axes, channels, noise[kept], tuple(made.values()), judge, tuple(notes),
                    next((n for n, s in machine.sensors.items() if s is known), None), unused)  # fmt: skip
 
