@@ -339,7 +339,7 @@ def _count_fit_rows(rows: RunRows) -> int:
 
 
 def describe_resting_axes(split: Split, axes: Sequence[str]) -> tuple[str, ...]:
-    """Return a note on axes that the held-out run hardly commands, although the fitted runs do; none if it commands all.
+    """Return a note on axes that the held-out run hardly commands, although the fitted runs do; or nothing.
 
     Args:
         split: the runs.
