@@ -24,14 +24,14 @@ AXIS_NAMES: Mapping[str, tuple[str, ...]] = {
     "swing": ("swing", "slew", "slewing", "turret", "house", "rotation", "upper", "upperstructure", "cab"),
     "boom": ("boom", "lift", "ausleger"),
     "stick": ("stick", "arm", "dipper", "jib", "stiel"),
-    "bucket": ("bucket", "tool", "loeffel"),
+    "bucket": ("bucket", "bkt", "tool", "loeffel"),
     "tilt": ("tilt",),
     "head": ("head",),
 }
 """Axis -> words that mean it; words of a machine's own axis names have precedence."""
 
 _KIND_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
-    ("command", frozenset({"command", "cmd", "commands", "joystick", "lever", "valve", "input", "control", "pilot"})),
+    ("command", frozenset({"command", "cmd", "commands", "joystick", "js", "lever", "valve", "input", "control", "pilot"})),
     ("pressure", frozenset({"pressure", "press", "p", "druck", "fluid"})),
     ("length", frozenset({"length", "stroke", "extension", "piston", "cylinder", "cyl", "len"})),
     ("velocity", frozenset({"velocity", "vel", "speed", "rate"})),
@@ -153,7 +153,8 @@ def _find_kind(words: Sequence[str], kind: str, unit: str | None) -> tuple[str |
     units = {si_unit_and_factor(text)[0] for text in (*(_UNIT_WORDS.get(word, "") for word in words), unit or "")}
     if kind.endswith("FluidPressure") or "Pa" in units:
         present.add("pressure")
-    found = next((name for name, known in _KIND_WORDS if known & present), "angle" if "rad" in units else None)
+    guess = "angle" if "rad" in units else "command" if unit == "%" else None
+    found = next((name for name, known in _KIND_WORDS if known & present), guess)
     if found == "command" and "pressure" in present and "pilot" not in present:
         found = "pressure"
     if found != "pressure":
@@ -176,7 +177,9 @@ def _find_axis(words: Sequence[str], machine: Machine | None) -> tuple[str, floa
         if re.search(rf"(^|_)({re.escape(name)}|{re.escape(joints.get(name, name))})(_|$)", text):
             return name, 1.0
     for name in names:
-        if set(AXIS_NAMES.get(name, ())) & set(words):
+        own = {*_split_words(name), *_split_words(joints.get(name, ""))}
+        alike = {word for known in AXIS_NAMES.values() if own & set(known) for word in known}
+        if alike & set(words):
             return name, 1.0
     for word in words:
         if len(word) > 3 and (near := difflib.get_close_matches(word, names, n=1, cutoff=0.8)):

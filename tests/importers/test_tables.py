@@ -319,3 +319,14 @@ def test_missing_values_are_saved_only_if_allowed(tmp_path):
         save_log(make_log(), tmp_path / "a.parquet")
     save_log(make_log(), tmp_path / "a.parquet", missing=True)
     assert np.isnan(load_log(tmp_path / "a.parquet")["pressure_head.boom"]).sum() == 250
+
+
+def test_columns_match_axes_with_names_of_joints(tmp_path):
+    machine = load_machine("cat215", "bucket")
+    renamed = machine.model_copy(update={"axes": {f"{name}_hinge": axis for name, axis in machine.axes.items()}})
+    names = ["Time [ms]", "JS_boom [%]", "Enc_arm [deg]", "P_ARM_bottom [bar]", "P_slew_b [bar]"]
+    table = np.column_stack([np.arange(50.0), *(np.linspace(20.0, 80.0, 50) for _ in names[1:])])
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(names), comments="")
+    found = {p.column: p.channel for p in propose_mapping(tmp_path / "log.csv", renamed)}
+    assert found == {"JS_boom": "command.boom_hinge", "Enc_arm": "angle.stick_hinge",
+                     "P_ARM_bottom": "pressure_head.stick_hinge", "P_slew_b": "pressure_rod.swing_hinge"}  # fmt: skip
