@@ -460,7 +460,12 @@ def _unknown(gap: Gap) -> tuple[str, ...]:
     error = f"on {_run(gap)} the prediction error is {_times(size.before, size)}."
     changes = _closing_changes(gap)
     first = f"Model and machine differ, and no known effect explains the difference: {error}"
-    if changes:
+    if size.noise_floor is not None and size.before <= size.noise_floor:
+        first = (
+            "Model and machine differ in the fitted runs, and no known effect explains the difference; the held-out run"
+            f" does not show it: {error}"
+        )
+    elif changes:
         first = f"Model and machine differ: {error} {_capital(changes)}, but no known effect has their form."
     return (first, *_located(gap))
 

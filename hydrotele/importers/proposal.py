@@ -31,7 +31,10 @@ AXIS_NAMES: Mapping[str, tuple[str, ...]] = {
 """Axis -> words that mean it; words of a machine's own axis names have precedence."""
 
 _KIND_WORDS: tuple[tuple[str, frozenset[str]], ...] = (
-    ("command", frozenset({"command", "cmd", "commands", "joystick", "js", "lever", "valve", "input", "control", "pilot"})),
+    (
+        "command",
+        frozenset({"command", "cmd", "commands", "joystick", "js", "lever", "valve", "input", "control", "pilot"}),
+    ),
     ("pressure", frozenset({"pressure", "press", "p", "druck", "fluid"})),
     ("length", frozenset({"length", "stroke", "extension", "piston", "cylinder", "cyl", "len"})),
     ("velocity", frozenset({"velocity", "vel", "speed", "rate"})),
