@@ -17,6 +17,7 @@ from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.levels import smoothed_inputs
 from hydrotele.estimate.track import STEP, track_run
+from hydrotele.gap.calibrating import fitted
 from hydrotele.gap.screening import screen
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "how_it_works"
@@ -28,6 +29,7 @@ COMMANDS = {  # valve commands at the times 0, 1, 2 ... s
 }
 CHANNEL = "length.slide"
 SHOWN_EFFECTS = 12
+FITTED_EFFECTS = 6
 
 
 def record_logs(folder: Path) -> None:
@@ -94,6 +96,14 @@ def main() -> None:
         axis.invert_yaxis()
         axis.set(xlabel="estimated gain in 2 log evidence")
         save(figure, "3_screening")
+
+        fits = sorted(fitted(evidence, base, ranked[:FITTED_EFFECTS]), key=lambda fit: -fit.score)
+        figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
+        names = [f"{fit.guess.hypotheses[-1].name}, {fit.guess.hypotheses[-1].location}" for fit in fits]
+        axis.barh(names, [fit.score for fit in fits])
+        axis.invert_yaxis()
+        axis.set(xlabel="gain in 2 log evidence after the fit, with the noise levels of the given machine")
+        save(figure, "4_fits")
     finally:
         evidence.close()
 
@@ -107,7 +117,20 @@ def main() -> None:
         xlabel="prediction error / its standard deviation, held-out run", ylabel="density", yscale="log", ylim=(1e-4, 1)
     )
     axis.legend()
-    save(figure, "4_held_out")
+    save(figure, "5_held_out")
+
+    values = DEADBAND + np.linspace(-4e-5, 4e-5, 9)
+    losses = []
+    for value in values:
+        machine = ht.apply_effect(data.machine, "valve_deadband", "slide", {"deadband": value})
+        losses.append(sum(track_run(machine, data, run).loss for run in data.fit))
+    a, b, c = np.polyfit(values, losses, 2)
+    best, std = -b / (2 * a), 1 / np.sqrt(a)
+    figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
+    axis.plot(100 * values, np.array(losses) - (c - b**2 / (4 * a)), "o-")
+    axis.axvspan(100 * (best - 1.96 * std), 100 * (best + 1.96 * std), color="0.85", zorder=0)
+    axis.set(xlabel="dead band [%]", ylabel="-2 log likelihood,\nabove its minimum")
+    save(figure, "6_interval")
 
 
 if __name__ == "__main__":
