@@ -651,7 +651,7 @@ def arriving(command, row, begin, end, period, delay):
     stop = row + (end - delay) / period
     total, here = 0.0, place
     while here < stop - 1e-9:
-        k = math.floor(here + 1e-9)
+        k = int(math.floor(here + 1e-9))  # CUDA's floor returns a float
         there = min(stop, k + 1.0)
         total += command[min(len(command) - 1, max(0, k))] * (there - here)
         here = there
