@@ -124,9 +124,9 @@ class Batch:
         self._start_of_machine = np.arange(count) % len(start)
         self.machines = _make_machines(models, np.ascontiguousarray(start, float), count, self._timing, seed)
         if device == "cuda":
-            from hydrotele.batch.cuda_kernel import CudaKernel
+            from hydrotele.batch.cuda_kernel import CudaRunner
 
-            self._runner: Any = CudaKernel(self._single, task)
+            self._runner: Any = CudaRunner(self._single, task, self.machine.terms)
             self.machines = self._runner.upload(self.machines)
             self._model, self._noise = self._runner.upload(self._model), self._runner.upload(self._noise)
             self._timing, self._arrays = self._runner.upload(self._timing), self._runner.upload(task.arrays)

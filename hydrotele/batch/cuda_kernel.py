@@ -1,0 +1,128 @@
+"""Batch on a CUDA device: a kernel with the functions of `machine_step`, one thread per machine.
+
+numba-cuda compiles the same Python functions as those of the CPU; `core.device` makes their CUDA forms. The
+work space of a machine is in the local memory of its thread. Arrays with one row per machine are stored
+column by column, so that neighbouring threads read neighbouring numbers.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hydrotele.batch import machine_step
+from hydrotele.batch.machine_step import Machines, Noise, Timing, run_machine
+from hydrotele.core.device import import_cuda, make_device_function
+from hydrotele.estimate.reduced_model import Model, Space, model_space, state_size
+from hydrotele.multibody.reduced_dynamics import ReducedMotion
+from hydrotele.terms.table import make_law_functions
+from hydrotele.terms.term import Term
+
+THREADS_PER_BLOCK = 64
+def make_cuda_kernel(model: Model, task: Any, terms: Sequence[Term]) -> Any:
+    """Return the CUDA kernel for machines with the structure of a model.
+
+    Args:
+        model: Model of one machine; the sizes of its work space are constants of the kernel.
+        task: `batch.Task`.
+        terms: terms of the machine.
+
+    Returns:
+        Kernel with the arguments (Model, Machines, Noise, Timing, arrays of the task, control periods).
+    """
+    cuda = import_cuda()
+    replaced: dict[Any, Any] = {}
+    replaced |= make_law_functions(terms, lambda function: make_device_function(function, replaced))
+    replaced[machine_step.before_period] = make_device_function(task.before, replaced)
+    replaced[machine_step.after_period] = make_device_function(task.after, replaced)
+    space = model_space(model)
+    motion, arrays = dict(space.motion._asdict()), {**space._asdict(), "z": np.zeros(state_size(model))}
+    del arrays["motion"]
+    scope = {
+        "cuda": cuda, "Space": Space, "ReducedMotion": ReducedMotion, "real": np.float64,
+        "run_machine": make_device_function(run_machine, replaced),
+    }  # fmt: skip
+    body = [line for name, array in (motion | arrays).items() for line in _local_array(name, array.shape)]
+    body += [
+        f"sp = Space(ReducedMotion({', '.join(motion)}), {', '.join(name for name in arrays if name != 'z')})",
+        "for k in range(len(z)):", "    z[k] = machines.state[i, k]",
+        "run_machine(model, sp, z, machines, i, noise, timing, task, periods)",
+        "for k in range(len(z)):", "    machines.state[i, k] = z[k]",
+    ]  # fmt: skip
+    head = ["def kernel(model, machines, noise, timing, task, periods):", "    i = cuda.grid(1)"]
+    head += ["    if i < machines.state.shape[0]:"]
+    exec("\n".join(head + [f"        {line}" for line in body]), scope)  # local arrays have constant sizes
+    return cuda.jit(scope["kernel"])
+
+
+def _local_array(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Return the source lines that allocate a zero array in the local memory of a thread."""
+    sizes = tuple(max(1, size) for size in shape)  # CUDA has no empty arrays
+    lines, indices = [f"{name}_all = cuda.local.array({sizes}, real)"], []
+    for depth, size in enumerate(sizes):
+        lines.append(f"{'    ' * depth}for i{depth} in range({size}):")
+        indices.append(f"i{depth}")
+    lines.append(f"{'    ' * len(sizes)}{name}_all[{', '.join(indices)}] = 0.0")
+    return [*lines, f"{name} = {name}_all" + ("" if shape[0] else "[:0]")]
+
+
+class CudaRunner:
+    """Runs the kernel of a batch on the present CUDA device."""
+
+    def __init__(self, model: Model, task: Any, terms: Sequence[Term]) -> None:
+        """Make the kernel; it is compiled on its first launch."""
+        self._cuda = import_cuda()
+        self._kernel = make_cuda_kernel(model, task, terms)
+
+    def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
+        """Launch the kernel; the call does not wait for its end."""
+        blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
+        self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods)
+
+    def upload(self, record: Any) -> Any:
+        """Return a NamedTuple with its arrays copied to the device, nested ones included."""
+        if isinstance(record, tuple):
+            return record._make(self.upload(part) for part in record)  # pyright: ignore[reportAttributeAccessIssue]
+        return self._copy_to_device(record) if isinstance(record, np.ndarray) else record
+
+    def _copy_to_device(self, array: np.ndarray) -> Any:
+        if array.size == 0:
+            whole = self._cuda.to_device(np.zeros(tuple(max(1, size) for size in array.shape), array.dtype))
+            return whole[tuple(slice(size) for size in array.shape)]
+        return self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+
+    def assign(self, array: Any, values: Any) -> None:
+        """Copy values of the CPU or of the device into an array of the device."""
+        if self._cuda.is_cuda_array(values):
+            _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
+        else:
+            array.copy_to_device(np.asfortranarray(np.broadcast_to(np.asarray(values, array.dtype), array.shape)))
+
+    def assign_rows(self, array: Any, rows: np.ndarray, values: Any) -> None:
+        """Copy values of the CPU into some rows of an array of the device."""
+        host = array.copy_to_host()
+        host[rows] = values
+        array.copy_to_device(np.asfortranarray(host))
+
+    def read(self, array: Any) -> np.ndarray:
+        """Return a copy of an array in the memory of the CPU."""
+        return array.copy_to_host()
+
+    def repeat(self, values: Any, count: int) -> Any:
+        """Return a device array with one row, repeated."""
+        return self._copy_to_device(np.repeat(values.copy_to_host()[:1], count, axis=0))
+
+
+@functools.cache
+def _copy_values(cuda: Any) -> Any:
+    """Return the kernel that copies a matrix, or one row to all rows, of another layout."""
+
+    @cuda.jit
+    def copy_values(target, source):
+        size = target.shape[0] * target.shape[1]
+        for k in range(cuda.grid(1), size, cuda.gridsize(1)):
+            i, j = k % target.shape[0], k // target.shape[0]
+            target[i, j] = source[i, j] if source.ndim == 2 else source[j]
+
+    return copy_values
