@@ -1,17 +1,21 @@
 """Batch of machines simulated by the reduced model, advanced by threads of the CPU or by a CUDA device."""
 
+import hashlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import intrinsic
 
 from hydrotele.batch import machine_step
-from hydrotele.batch.machine_step import Machines, Noise, Timing, load_linkage, store_linkage
+from hydrotele.batch.machine_step import Machines, Noise, Timing, make_lanes, store_linkage
+from hydrotele.batch.mechanism_code import MechanismCode, trace_mechanism
 from hydrotele.core.device import rebuild_function
 from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.errors import InputError
+from hydrotele.core.tracing import make_program_function
 from hydrotele.estimate.reduced_model import (
     Model,
     model_space,
@@ -33,6 +37,9 @@ PARAMETERS = (
 )  # fmt: skip
 """Arrays of `Model` and its mechanism that can differ between the machines of a batch."""
 _MECHANISM_PARAMETERS = ("shape", "joint", "gravity")
+
+
+LANES = 8  # machines per block on the CPU: two vectors of four numbers
 
 
 class Task(NamedTuple):
@@ -131,7 +138,7 @@ class Batch:
             self._model, self._noise = self._runner.upload(self._model), self._runner.upload(self._noise)
             self._timing, self._arrays = self._runner.upload(self._timing), self._runner.upload(task.arrays)
         else:
-            self._runner, self._arrays = _ThreadRunner(self._single, task, options.get("threads", 0)), task.arrays
+            self._runner, self._arrays = _ThreadRunner(self._single, self._model, task, options.get("threads", 0)), task.arrays
 
     @property
     def state(self) -> Any:
@@ -290,18 +297,19 @@ def _make_machines(models: list[Model], start: np.ndarray, count: int, timing: T
 class _ThreadRunner:
     """Runs `machine_step.run_machines` by threads, each with its own work space."""
 
-    def __init__(self, model: Model, task: Task, threads: int) -> None:
+    def __init__(self, model: Model, stacked: Model, task: Task, threads: int) -> None:
         self._threads = threads or len(os.sched_getaffinity(0))
-        self._spaces = [model_space(model) for _ in range(self._threads)]
+        code = trace_mechanism(model, stacked)
+        self._lanes = [make_lanes(model, code, LANES) for _ in range(self._threads)]
         self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
-        self._function = make_batch_function(task)
+        self._function = make_batch_function(code, task)
 
     def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
         """Advance all machines by some control periods."""
         ends = np.linspace(0, len(machines.state), self._threads + 1).astype(int)
         jobs = [
-            (model, space, machines, noise, timing, arrays, periods, int(begin), int(end))
-            for space, begin, end in zip(self._spaces, ends[:-1], ends[1:], strict=True)
+            (model, lanes, machines, noise, timing, arrays, periods, int(begin), int(end))
+            for lanes, begin, end in zip(self._lanes, ends[:-1], ends[1:], strict=True)
         ]
         if self._pool is None:
             self._function(*jobs[0])
@@ -326,16 +334,21 @@ class _ThreadRunner:
         return np.repeat(values[:1], count, axis=0)
 
 
-def make_batch_function(task: Task) -> Any:
-    """Return `machine_step.run_machines` with the functions of a task, compiled and cached with the task's module."""
-    if task.before is machine_step.before_period and task.after is machine_step.after_period:
-        return machine_step.run_machines
-    swapped = {machine_step.before_period: task.before, machine_step.after_period: task.after}
-    module = task.after.py_func.__module__
+def make_batch_function(code: MechanismCode, task: Task) -> Any:
+    """Return `machine_step.run_machines` with the code of a mechanism and the functions of a task."""
+    swapped = {
+        getattr(machine_step, f"run_{name}"): make_program_function(
+            getattr(code, name), LANES, compile_without_allocation, intrinsic
+        )
+        for name in ("move", "correct", "place", "pose")
+    }
+    swapped |= {machine_step.before_period: task.before, machine_step.after_period: task.after}
+    names = repr([(f.py_func.__module__, f.py_func.__qualname__) for f in swapped.values()])
+    digest = hashlib.sha256(names.encode()).hexdigest()[:16]
 
     def wrap(function: Any) -> Any:
-        function.__module__ = module
-        function.__qualname__ = f"{task.after.py_func.__qualname__}_{function.__name__}"
+        function.__module__ = task.after.py_func.__module__  # its cache depends on the task's source
+        function.__qualname__ += f"_{digest}"
         return compile_without_allocation(function)
 
     return rebuild_function(machine_step.run_machines, wrap, swapped, copy_all=False)

@@ -1,7 +1,11 @@
-"""One control period of one machine of a batch: commands, dynamics, sensors; compiled for CPU and CUDA.
+"""One control period of the machines of a batch: commands, dynamics, sensors; compiled for CPU and CUDA.
 
-The dynamics are `estimate.reduced_model.advance`. All arrays of a batch have one row per machine. Parameters
-that are equal for all machines have one row.
+The equations and their order are those of `estimate.reduced_model.advance`, and the results are equal bit by
+bit. A block of machines takes each step together: the straight-line code of the mechanism computes all of them with
+vector instructions. Valves, chambers and friction, which branch, follow machine by machine. A thread of a CUDA
+device has one machine.
+
+All arrays of a batch have one row per machine. Parameters that are equal for all machines have one row.
 """
 
 import math
@@ -9,14 +13,33 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hydrotele.batch.mechanism_code import HALF_KICK, JOINT, SHAPE, STEP, MechanismCode, array_shapes
 from hydrotele.batch.random_numbers import normal_number, uniform_number
 from hydrotele.core.compiled import compile_without_allocation
-from hydrotele.estimate.reduced_model import Model, Space, add_sensor_drift, advance, read_channels
-from hydrotele.multibody.reduced_dynamics import ACCELERATION, Q
-from hydrotele.multibody.reduced_mechanism import HOME, ReducedMechanism
+from hydrotele.estimate.reduced_model import (
+    Model,
+    Space,
+    add_drive_forces,
+    add_sensor_drift,
+    advance_oil,
+    kick_rates,
+    model_space,
+    set_activations,
+    show_channels,
+    take_commands,
+)
+from hydrotele.multibody.reduced_dynamics import (
+    CLOSURE_TOLERANCE,
+    ReducedMotion,
+    Q,
+    factorise_cholesky,
+    solve_cholesky,
+)
+from hydrotele.multibody.reduced_mechanism import ReducedMechanism
 from hydrotele.simulate.sensor_models import quantise_reading
 
-__all__ = ["Machines", "Model", "Noise", "Space", "Timing", "run_machine", "run_machines"]
+_MAX_CORRECTIONS = 20  # maximum number of Newton iterations, as in `reduced_dynamics.close_loops`
+LOAD, START, FINISH, STORE, FIRST_KICK = range(-4, 1)  # stages of `run_stage`; further ones are time steps
 
 
 class Machines(NamedTuple):
@@ -84,6 +107,86 @@ class Timing(NamedTuple):
     period: float
     steps: int
     max_change: np.ndarray
+
+
+class Lanes(NamedTuple):
+    """Work space of a block of L machines; the first dimension of most arrays is the machine.
+
+    Attributes:
+        z: (L, n) states.
+        joint: (L, 4, N), `basis`, `frame`, `bar`: see `ReducedMotion`.
+        basis: (L, N, n).
+        frame: (L, f, FRAME_SIZE).
+        bar: (L, bars, 3 + N).
+        row: (L, nu, n), `mass`, `force`, `drive`, `act`, `act_dot`, `scratch`, `time`: see `Space`.
+        mass: (L, n + t, n + t).
+        force: (L, n + t).
+        drive: (L, 5, nu).
+        residual: (L, 1) largest closure residual [m].
+        parameter: (p, L) geometry and masses that the traced code reads, see `MechanismCode.parameters`.
+        step: (2, L) length of the step and half the length of the kick [s].
+        act: (L, na).
+        act_dot: (L, na).
+        scratch: (L, s).
+        time: (L, 2).
+        source: (p, 3) `MechanismCode.parameters`.
+        empty: (1, 1, 1), for arrays of `ReducedMotion` that traced code does not have.
+        has_closures: whether the mechanism has dependent coordinates.
+    """
+
+    z: np.ndarray
+    joint: np.ndarray
+    basis: np.ndarray
+    frame: np.ndarray
+    bar: np.ndarray
+    row: np.ndarray
+    mass: np.ndarray
+    force: np.ndarray
+    drive: np.ndarray
+    residual: np.ndarray
+    parameter: np.ndarray
+    step: np.ndarray
+    act: np.ndarray
+    act_dot: np.ndarray
+    scratch: np.ndarray
+    time: np.ndarray
+    source: np.ndarray
+    empty: np.ndarray
+    has_closures: bool
+
+
+def make_lanes(model: Model, code: MechanismCode, count: int) -> Lanes:
+    """Allocate the work space of a block of `count` machines with a model of one machine."""
+    space = model_space(model)
+    shapes = array_shapes(model) | {name: getattr(space, name).shape for name in ("act", "act_dot", "scratch", "time")}
+    lanes = Lanes(
+        **{name: np.zeros((count, *shape)) for name, shape in shapes.items()},
+        parameter=np.zeros((len(code.parameters), count)), step=np.zeros((2, count)), source=code.parameters,
+        empty=np.zeros((1, 1, 1)), has_closures=code.has_closures,
+    )  # fmt: skip
+    lanes.frame[:] = space.motion.frame
+    lanes.basis[:] = space.motion.basis
+    return lanes
+
+
+@compile_without_allocation
+def run_move(arrays):
+    """Stand for the program `MechanismCode.move` of a machine; the argument is a tuple of the arrays `ARRAYS`."""
+
+
+@compile_without_allocation
+def run_correct(arrays):
+    """Stand for the program `MechanismCode.correct` of a machine."""
+
+
+@compile_without_allocation
+def run_place(arrays):
+    """Stand for the program `MechanismCode.place` of a machine."""
+
+
+@compile_without_allocation
+def run_pose(arrays):
+    """Stand for the program `MechanismCode.pose` of a machine."""
 
 
 @compile_without_allocation
@@ -193,7 +296,7 @@ def sample_readings(model, sp, z, machines, i, noise, time):
     Source: models/cat215/README.md, "Sensors".
     """
     out, error = machines.reading[i], machines.error[i]
-    read_channels(model, sp, z, 0, 1, 1.0, machines.reading[:0], out)
+    show_channels(model, sp, z, 0, 1, 1.0, machines.reading[:0], out)
     add_sensor_drift(model, time, out)
     seed, sample = machines.seed[i], machines.sample_count[i]
     machines.sample_count[i] = sample + 1
@@ -208,58 +311,53 @@ def sample_readings(model, sp, z, machines, i, noise, time):
 
 
 @compile_without_allocation
-def advance_machine(model, sp, z, machines, i, noise, timing):
-    """Advance machine i by one control period and sample its sensors.
+def place_block(lanes, step, half_kick, as_pose):
+    """Advance the positions of all machines of a block by a step and place their mechanisms.
 
     Args:
-        model: Model of the machine.
-        sp: Space after `load_linkage`.
-        z: (n,) state, advanced in place.
-        machines: Machines; row i is written, except for the state.
-        i: index of the machine.
-        noise: Noise.
-        timing: Timing.
+        lanes: Lanes.
+        step: length of the step, scalar [s]; 0 to place only.
+        half_kick: half the length of the kick that follows, scalar [s].
+        as_pose: whether to compute the frames of the links instead of mass matrix and forces.
     """
-    history = machines.history[i]
-    take_command(history, machines.command[i], timing.max_change)
-    row = len(history) - 1
-    sp.time[1] = (machines.period_count[i] - row) * timing.period
-    advance(model, sp, z, history, row, timing.period, timing.steps, machines.reading[:0])
-    machines.period_count[i] += 1
-    sample_readings(model, sp, z, machines, i, noise, machines.period_count[i] * timing.period)
-    total = 0.0
-    for k in range(len(z)):
-        total += z[k] - z[k]  # not 0 if a state is not finite
-    machines.failed[i] = 0 if total == 0.0 else 1
+    for lane in range(len(lanes.z)):
+        lanes.step[STEP, lane], lanes.step[HALF_KICK, lane] = step, half_kick
+    arrays = (
+        lanes.z, lanes.joint, lanes.basis, lanes.frame, lanes.bar, lanes.row, lanes.mass, lanes.force, lanes.drive,
+        lanes.residual, lanes.parameter, lanes.step,
+    )  # fmt: skip
+    run_move(arrays)
+    if lanes.has_closures and step > 0.0:
+        run_correct(arrays)
+    for _ in range(_MAX_CORRECTIONS):
+        if as_pose:
+            run_pose(arrays)
+        else:
+            run_place(arrays)
+        worst = 0.0
+        for lane in range(len(lanes.z)):
+            worst = max(worst, lanes.residual[lane, 0])
+        if worst < CLOSURE_TOLERANCE:
+            return
+        run_correct(arrays)
 
 
 @compile_without_allocation
-def prepare_space(model, sp):
-    """Set the world's frame and the independent coordinates' rows of a zero work space."""
-    frame, basis, mech = sp.motion.frame, sp.motion.basis, model.mech
-    for r in range(3):
-        frame[0, 4 * r] = 1.0
-        frame[0, ACCELERATION + r] = -mech.gravity[r]
-    for f in range(len(mech.independent)):
-        basis[mech.independent[f], f] = 1.0
-    for k in range(sp.motion.joint.shape[1]):
-        sp.motion.joint[Q, k] = mech.joint[HOME, k]
-
-
-@compile_without_allocation
-def run_machine(model, sp, z, machines, i, noise, timing, task, periods):
-    """Advance machine i by some control periods, with the functions of a task before and after each.
+def run_stage(model, lanes, machines, noise, timing, task, i, lane, stage):
+    """Do one stage of a control period of a machine.
 
     Args:
-        model: Model whose numbers have a leading dimension of 1 or the number of machines.
-        sp: Space, whose arrays were zero before its first use.
-        z: (n,) state of the machine, advanced in place.
-        machines: Machines; row i is written, except for the state.
-        i: index of the machine.
+        model: Model whose parameters have a leading dimension of 1 or the number of machines.
+        lanes: Lanes.
+        machines: Machines.
         noise: Noise.
         timing: Timing.
         task: NamedTuple of arrays of the task.
-        periods: number of control periods.
+        i: index of the machine.
+        lane: its place in the block.
+        stage: LOAD, start of the closures' solution; START, command of the period; FIRST_KICK, half a kick at the
+            start of the period; 1 .. steps, oil and kick of a time step after its positions; FINISH,
+            readings; or STORE, the inverse of LOAD.
     """
     mech = model.mech
     own = Model(
@@ -274,17 +372,107 @@ def run_machine(model, sp, z, machines, i, noise, timing, task, periods):
         model.scale[i if len(model.scale) > 1 else 0], model.offset[i if len(model.offset) > 1 else 0],
         model.lag, model.terms, model.time_constant, model.drift[i if len(model.drift) > 1 else 0], model.memory,
     )  # fmt: skip
-    prepare_space(own, sp)
-    load_linkage(own, sp, machines.linkage[i])
-    for _ in range(periods):
+    sp = Space(
+        ReducedMotion(
+            lanes.frame[lane], lanes.empty, lanes.empty, lanes.bar[lane], lanes.empty[0], lanes.joint[lane],
+            lanes.basis[lane], lanes.empty[0], lanes.empty[0],
+        ),
+        lanes.drive[lane], lanes.row[lane], lanes.mass[lane], lanes.force[lane], lanes.act[lane],
+        lanes.act_dot[lane], lanes.scratch[lane], lanes.time[lane],
+    )  # fmt: skip
+    z, history = lanes.z[lane], machines.history[i]
+    row, h = len(history) - 1, timing.period / timing.steps
+    if stage == LOAD:
+        load_linkage(own, sp, machines.linkage[i])
+    elif stage == START:
         before_period(task, own, sp, z, machines, i)
-        advance_machine(own, sp, z, machines, i, noise, timing)
+        take_command(history, machines.command[i], timing.max_change)
+        sp.time[1] = (machines.period_count[i] - row) * timing.period
+        sp.time[0] = sp.time[1] + row * timing.period
+        take_commands(own, sp.drive, history, row, 0.0, h, timing.period)
+    elif stage >= FIRST_KICK:
+        set_activations(own, sp, z)
+        kick = 0.5 * h
+        if stage > FIRST_KICK:
+            take_commands(own, sp.drive, history, row, (stage - 1) * h, stage * h, timing.period)
+            advance_oil(own, sp, z, h)
+            sp.time[0] = sp.time[1] + row * timing.period + stage * h
+            if stage < timing.steps:
+                kick = h
+        add_drive_forces(own, sp, z, kick)
+        factorise_cholesky(sp.mass)
+        solve_cholesky(sp.mass, sp.force)
+        kick_rates(own, sp, z, kick)
+    elif stage == FINISH:
+        set_activations(own, sp, z)
+        machines.period_count[i] += 1
+        sample_readings(own, sp, z, machines, i, noise, machines.period_count[i] * timing.period)
+        total = 0.0
+        for k in range(len(z)):
+            total += z[k] - z[k]  # not 0 if a state is not finite
+        machines.failed[i] = 0 if total == 0.0 else 1
         after_period(task, own, sp, z, machines, i)
-    store_linkage(own, sp, machines.linkage[i])
+    else:
+        store_linkage(own, sp, machines.linkage[i])
 
 
 @compile_without_allocation
-def run_machines(model, sp, machines, noise, timing, task, periods, begin, end):
-    """Call `run_machine` for the machines begin .. end - 1 of a batch on the CPU."""
-    for i in range(begin, end):
-        run_machine(model, sp, machines.state[i], machines, i, noise, timing, task, periods)
+def load_parameters(model, lanes, i, lane):
+    """Copy geometry and masses of machine i to the parameters of the traced code."""
+    mech = model.mech
+    for p in range(len(lanes.source)):
+        kind, r, c = lanes.source[p, 0], lanes.source[p, 1], lanes.source[p, 2]
+        if kind == SHAPE:
+            lanes.parameter[p, lane] = mech.shape[i if len(mech.shape) > 1 else 0, r, c]
+        elif kind == JOINT:
+            lanes.parameter[p, lane] = mech.joint[i if len(mech.joint) > 1 else 0, r, c]
+        else:
+            lanes.parameter[p, lane] = mech.gravity[i if len(mech.gravity) > 1 else 0, r]
+
+
+@compile_without_allocation
+def run_block(model, lanes, machines, noise, timing, task, periods, first, count):
+    """Advance a block of machines by some control periods, with the functions of a task before and after each.
+
+    Args:
+        model: Model whose parameters have a leading dimension of 1 or the number of machines.
+        lanes: Lanes.
+        machines: Machines.
+        noise: Noise.
+        timing: Timing.
+        task: NamedTuple of arrays of the task.
+        periods: number of control periods.
+        first: index of the first machine.
+        count: number of machines, at most that of the lanes; unused lanes compute copies of the last machine.
+    """
+    h = timing.period / timing.steps
+    for lane in range(len(lanes.z)):
+        i = first + min(lane, count - 1)
+        for k in range(lanes.z.shape[1]):
+            lanes.z[lane, k] = machines.state[i, k]
+        load_parameters(model, lanes, i, lane)
+        run_stage(model, lanes, machines, noise, timing, task, i, lane, LOAD)
+    for _ in range(periods):
+        for lane in range(count):
+            run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, START)
+        place_block(lanes, 0.0, 0.25 * h, False)
+        for stage in range(timing.steps + 1):
+            if stage > FIRST_KICK:
+                place_block(lanes, h, 0.5 * h if stage < timing.steps else 0.25 * h, False)
+            for lane in range(count):
+                run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, stage)
+        place_block(lanes, 0.0, 0.0, True)
+        for lane in range(count):
+            run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, FINISH)
+    for lane in range(count):
+        run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, STORE)
+        for k in range(lanes.z.shape[1]):
+            machines.state[first + lane, k] = lanes.z[lane, k]
+
+
+@compile_without_allocation
+def run_machines(model, lanes, machines, noise, timing, task, periods, begin, end):
+    """Call `run_block` for the machines begin .. end - 1 of a batch on the CPU."""
+    for first in range(begin, end, len(lanes.z)):
+        count = min(len(lanes.z), end - first)
+        run_block(model, lanes, machines, noise, timing, task, periods, first, count)
