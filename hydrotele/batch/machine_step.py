@@ -343,6 +343,45 @@ def place_block(lanes, step, half_kick, as_pose):
 
 
 @compile_without_allocation
+def do_stage(model, sp, z, machines, noise, timing, task, i, stage):
+    """Do one stage of a control period of machine i with its Model, Space and state (n,); see `run_stage`."""
+    history = machines.history[i]
+    row, h = len(history) - 1, timing.period / timing.steps
+    if stage == LOAD:
+        load_linkage(model, sp, machines.linkage[i])
+    elif stage == START:
+        before_period(task, model, sp, z, machines, i)
+        take_command(history, machines.command[i], timing.max_change)
+        sp.time[1] = (machines.period_count[i] - row) * timing.period
+        sp.time[0] = sp.time[1] + row * timing.period
+        take_commands(model, sp.drive, history, row, 0.0, h, timing.period)
+    elif stage >= FIRST_KICK:
+        set_activations(model, sp, z)
+        kick = 0.5 * h
+        if stage > FIRST_KICK:
+            take_commands(model, sp.drive, history, row, (stage - 1) * h, stage * h, timing.period)
+            advance_oil(model, sp, z, h)
+            sp.time[0] = sp.time[1] + row * timing.period + stage * h
+            if stage < timing.steps:
+                kick = h
+        add_drive_forces(model, sp, z, kick)
+        factorise_cholesky(sp.mass)
+        solve_cholesky(sp.mass, sp.force)
+        kick_rates(model, sp, z, kick)
+    elif stage == FINISH:
+        set_activations(model, sp, z)
+        machines.period_count[i] += 1
+        sample_readings(model, sp, z, machines, i, noise, machines.period_count[i] * timing.period)
+        total = 0.0
+        for k in range(len(z)):
+            total += z[k] - z[k]  # not 0 if a state is not finite
+        machines.failed[i] = 0 if total == 0.0 else 1
+        after_period(task, model, sp, z, machines, i)
+    else:
+        store_linkage(model, sp, machines.linkage[i])
+
+
+@compile_without_allocation
 def run_stage(model, lanes, machines, noise, timing, task, i, lane, stage):
     """Do one stage of a control period of a machine.
 
@@ -380,40 +419,7 @@ def run_stage(model, lanes, machines, noise, timing, task, i, lane, stage):
         lanes.drive[lane], lanes.row[lane], lanes.mass[lane], lanes.force[lane], lanes.act[lane],
         lanes.act_dot[lane], lanes.scratch[lane], lanes.time[lane],
     )  # fmt: skip
-    z, history = lanes.z[lane], machines.history[i]
-    row, h = len(history) - 1, timing.period / timing.steps
-    if stage == LOAD:
-        load_linkage(own, sp, machines.linkage[i])
-    elif stage == START:
-        before_period(task, own, sp, z, machines, i)
-        take_command(history, machines.command[i], timing.max_change)
-        sp.time[1] = (machines.period_count[i] - row) * timing.period
-        sp.time[0] = sp.time[1] + row * timing.period
-        take_commands(own, sp.drive, history, row, 0.0, h, timing.period)
-    elif stage >= FIRST_KICK:
-        set_activations(own, sp, z)
-        kick = 0.5 * h
-        if stage > FIRST_KICK:
-            take_commands(own, sp.drive, history, row, (stage - 1) * h, stage * h, timing.period)
-            advance_oil(own, sp, z, h)
-            sp.time[0] = sp.time[1] + row * timing.period + stage * h
-            if stage < timing.steps:
-                kick = h
-        add_drive_forces(own, sp, z, kick)
-        factorise_cholesky(sp.mass)
-        solve_cholesky(sp.mass, sp.force)
-        kick_rates(own, sp, z, kick)
-    elif stage == FINISH:
-        set_activations(own, sp, z)
-        machines.period_count[i] += 1
-        sample_readings(own, sp, z, machines, i, noise, machines.period_count[i] * timing.period)
-        total = 0.0
-        for k in range(len(z)):
-            total += z[k] - z[k]  # not 0 if a state is not finite
-        machines.failed[i] = 0 if total == 0.0 else 1
-        after_period(task, own, sp, z, machines, i)
-    else:
-        store_linkage(own, sp, machines.linkage[i])
+    do_stage(own, sp, lanes.z[lane], machines, noise, timing, task, i, stage)
 
 
 @compile_without_allocation
@@ -427,7 +433,7 @@ def load_parameters(model, lanes, i, lane):
         elif kind == JOINT:
             lanes.parameter[p, lane] = mech.joint[i if len(mech.joint) > 1 else 0, r, c]
         else:
-            lanes.parameter[p, lane] = mech.gravity[i if len(mech.gravity) > 1 else 0, r]
+            lanes.parameter[p, lane] = mech.gravity[i if len(mech.gravity) > 1 else 0, c]
 
 
 @compile_without_allocation
