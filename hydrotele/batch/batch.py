@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from hydrotele.batch import machine_step
 from hydrotele.batch.machine_step import Machines, Noise, Timing, make_lanes, store_linkage
-from hydrotele.batch.mechanism_code import MechanismCode, trace_mechanism
+from hydrotele.batch.mechanism_code import PROGRAMS, MechanismCode, trace_mechanism
 from hydrotele.core.device import rebuild_function
 from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.errors import InputError
@@ -133,7 +133,7 @@ class Batch:
         if device == "cuda":
             from hydrotele.batch.cuda_kernel import CudaRunner
 
-            self._runner: Any = CudaRunner(self._single, task, self.machine.terms)
+            self._runner: Any = CudaRunner(self._single, self._model, task, self.machine.terms)
             self.machines = self._runner.upload(self.machines)
             self._model, self._noise = self._runner.upload(self._model), self._runner.upload(self._noise)
             self._timing, self._arrays = self._runner.upload(self._timing), self._runner.upload(task.arrays)
@@ -282,7 +282,7 @@ def _make_machines(models: list[Model], start: np.ndarray, count: int, timing: T
         sp = model_space(own)
         place(own, sp, state)
         linkage.append(np.zeros(sp.motion.joint.shape[1] + len(own.mech.dependent) * sp.motion.basis.shape[1]))
-        store_linkage(own, sp, linkage[-1])
+        store_linkage(own.mech.dependent, sp.motion.joint, sp.motion.basis, linkage[-1])
     rows, places = np.array(linkage), np.arange(count) % len(start)
     history = 1 + int(np.ceil(model.delay.max(initial=0.0) / timing.period - 1e-9))
     return Machines(
@@ -340,7 +340,7 @@ def make_batch_function(code: MechanismCode, task: Task) -> Any:
         getattr(machine_step, f"run_{name}"): make_program_function(
             getattr(code, name), LANES, compile_without_allocation, intrinsic
         )
-        for name in ("move", "correct", "place", "pose")
+        for name in PROGRAMS
     }
     swapped |= {machine_step.before_period: task.before, machine_step.after_period: task.after}
     names = repr([(f.py_func.__module__, f.py_func.__qualname__) for f in swapped.values()])

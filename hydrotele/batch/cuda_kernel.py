@@ -12,73 +12,80 @@ from typing import Any
 import numpy as np
 
 from hydrotele.batch import machine_step
-from hydrotele.batch.machine_step import Machines, Noise, Timing, run_machine
+from hydrotele.batch.machine_step import Machines, Noise, Timing
+from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, trace_mechanism
 from hydrotele.core.device import import_cuda, make_device_function
-from hydrotele.estimate.reduced_model import Model, Space, model_space, state_size
-from hydrotele.multibody.reduced_dynamics import ReducedMotion
+from hydrotele.core.tracing import make_device_program
+from hydrotele.estimate.reduced_model import Model
 from hydrotele.terms.table import make_law_functions
 from hydrotele.terms.term import Term
 
 THREADS_PER_BLOCK = 64
-def make_cuda_kernel(model: Model, task: Any, terms: Sequence[Term]) -> Any:
+def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> Any:
     """Return the CUDA kernel for machines with the structure of a model.
 
     Args:
         model: Model of one machine; the sizes of its work space are constants of the kernel.
+        stacked: Model whose parameters have a leading dimension for the machines.
         task: `batch.Task`.
         terms: terms of the machine.
 
     Returns:
-        Kernel with the arguments (Model, Machines, Noise, Timing, arrays of the task, control periods).
+        (kernel with the arguments (Model, Machines, Noise, Timing, arrays of the task, control periods,
+        `MechanismCode.parameters`), these parameters).
     """
     cuda = import_cuda()
     replaced: dict[Any, Any] = {}
     replaced |= make_law_functions(terms, lambda function: make_device_function(function, replaced))
     replaced[machine_step.before_period] = make_device_function(task.before, replaced)
     replaced[machine_step.after_period] = make_device_function(task.after, replaced)
-    space = model_space(model)
-    motion, arrays = dict(space.motion._asdict()), {**space._asdict(), "z": np.zeros(state_size(model))}
-    del arrays["motion"]
+    code = trace_mechanism(model, stacked)
+    for name in PROGRAMS:
+        replaced[getattr(machine_step, f"run_{name}")] = make_device_program(getattr(code, name), ARRAYS)
+    lanes = machine_step.make_lanes(model, code, 1)
+    arrays = {name: value for name, value in lanes._asdict().items() if name not in ("source", "has_closures")}
     scope = {
-        "cuda": cuda, "Space": Space, "ReducedMotion": ReducedMotion, "real": np.float64,
-        "run_machine": make_device_function(run_machine, replaced),
+        "cuda": cuda, "Lanes": machine_step.Lanes, "real": np.float64,
+        "run_block": make_device_function(machine_step.run_block, replaced),
     }  # fmt: skip
-    body = [line for name, array in (motion | arrays).items() for line in _local_array(name, array.shape)]
+    body = [line for name, array in arrays.items() for line in _local_array(name, array)]
+    names = ", ".join(f"{name}={name}" for name in arrays)
     body += [
-        f"sp = Space(ReducedMotion({', '.join(motion)}), {', '.join(name for name in arrays if name != 'z')})",
-        "for k in range(len(z)):", "    z[k] = machines.state[i, k]",
-        "run_machine(model, sp, z, machines, i, noise, timing, task, periods)",
-        "for k in range(len(z)):", "    machines.state[i, k] = z[k]",
-    ]  # fmt: skip
-    head = ["def kernel(model, machines, noise, timing, task, periods):", "    i = cuda.grid(1)"]
+        f"lanes = Lanes({names}, source=source, has_closures={code.has_closures})",
+        "run_block(model, lanes, machines, noise, timing, task, periods, i, 1)",
+    ]
+    head = ["def kernel(model, machines, noise, timing, task, periods, source):", "    i = cuda.grid(1)"]
     head += ["    if i < machines.state.shape[0]:"]
     exec("\n".join(head + [f"        {line}" for line in body]), scope)  # local arrays have constant sizes
-    return cuda.jit(scope["kernel"])
+    return cuda.jit(scope["kernel"]), code.parameters
 
 
-def _local_array(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Return the source lines that allocate a zero array in the local memory of a thread."""
-    sizes = tuple(max(1, size) for size in shape)  # CUDA has no empty arrays
-    lines, indices = [f"{name}_all = cuda.local.array({sizes}, real)"], []
+def _local_array(name: str, values: np.ndarray) -> list[str]:
+    """Return the source lines that allocate an array with some values in the local memory of a thread."""
+    sizes = tuple(max(1, size) for size in values.shape)  # CUDA has no empty arrays
+    lines, indices = [f"{name} = cuda.local.array({sizes}, real)"], []
     for depth, size in enumerate(sizes):
         lines.append(f"{'    ' * depth}for i{depth} in range({size}):")
         indices.append(f"i{depth}")
-    lines.append(f"{'    ' * len(sizes)}{name}_all[{', '.join(indices)}] = 0.0")
-    return [*lines, f"{name} = {name}_all" + ("" if shape[0] else "[:0]")]
+    lines.append(f"{'    ' * len(sizes)}{name}[{', '.join(indices)}] = 0.0")
+    return lines + [f"{name}[{', '.join(map(str, k))}] = {values[tuple(k)]}" for k in np.argwhere(values)]
 
 
 class CudaRunner:
     """Runs the kernel of a batch on the present CUDA device."""
 
-    def __init__(self, model: Model, task: Any, terms: Sequence[Term]) -> None:
+    def __init__(self, model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> None:
         """Make the kernel; it is compiled on its first launch."""
         self._cuda = import_cuda()
-        self._kernel = make_cuda_kernel(model, task, terms)
+        self._kernel, parameters = make_cuda_kernel(model, stacked, task, terms)
+        self._parameters = self._copy_to_device(parameters)
 
     def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
         """Launch the kernel; the call does not wait for its end."""
         blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
-        self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods)
+        self._kernel[blocks, THREADS_PER_BLOCK](
+            model, machines, noise, timing, arrays, periods, self._parameters
+        )
 
     def upload(self, record: Any) -> Any:
         """Return a NamedTuple with its arrays copied to the device, nested ones included."""

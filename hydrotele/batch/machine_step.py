@@ -39,7 +39,7 @@ from hydrotele.multibody.reduced_mechanism import ReducedMechanism
 from hydrotele.simulate.sensor_models import quantise_reading
 
 _MAX_CORRECTIONS = 20  # maximum number of Newton iterations, as in `reduced_dynamics.close_loops`
-LOAD, START, FINISH, STORE, FIRST_KICK = range(-4, 1)  # stages of `run_stage`; further ones are time steps
+START, FIRST_KICK = range(2)  # stages of a control period, see `run_stage`
 
 
 class Machines(NamedTuple):
@@ -116,7 +116,7 @@ class Lanes(NamedTuple):
         z: (L, n) states.
         joint: (L, 4, N), `basis`, `frame`, `bar`: see `ReducedMotion`.
         basis: (L, N, n).
-        frame: (L, f, FRAME_SIZE).
+        frame: (L, l + 1, 18) rotation, origin, spin and velocity of the world and of the l links.
         bar: (L, bars, 3 + N).
         row: (L, nu, n), `mass`, `force`, `drive`, `act`, `act_dot`, `scratch`, `time`: see `Space`.
         mass: (L, n + t, n + t).
@@ -164,7 +164,6 @@ def make_lanes(model: Model, code: MechanismCode, count: int) -> Lanes:
         parameter=np.zeros((len(code.parameters), count)), step=np.zeros((2, count)), source=code.parameters,
         empty=np.zeros((1, 1, 1)), has_closures=code.has_closures,
     )  # fmt: skip
-    lanes.frame[:] = space.motion.frame
     lanes.basis[:] = space.motion.basis
     return lanes
 
@@ -234,32 +233,30 @@ def restart_machine(model, sp, z, machines, i, start):
     for c in range(machines.error.shape[1]):
         machines.error[i, c] = 0.0
     machines.period_count[i], machines.failed[i] = 0, 0
-    load_linkage(model, sp, machines.linkage[i])
+    load_linkage(model.mech.dependent, sp.motion.joint, sp.motion.basis, machines.linkage[i])
 
 
 @compile_without_allocation
-def load_linkage(model, sp, linkage):
+def load_linkage(dependent, joint, basis, linkage):
     """Copy the start of the closed chains' solution from a row of `Machines.linkage` to the work space."""
-    joint, basis, mech = sp.motion.joint, sp.motion.basis, model.mech
     at = joint.shape[1]
     for k in range(at):
         joint[Q, k] = linkage[k]
-    for b in range(len(mech.dependent)):
+    for b in range(len(dependent)):
         for f in range(basis.shape[1]):
-            basis[mech.dependent[b], f] = linkage[at]
+            basis[dependent[b], f] = linkage[at]
             at += 1
 
 
 @compile_without_allocation
-def store_linkage(model, sp, linkage):
+def store_linkage(dependent, joint, basis, linkage):
     """Copy the start of the closed chains' solution from the work space to a row of `Machines.linkage`."""
-    joint, basis, mech = sp.motion.joint, sp.motion.basis, model.mech
     at = joint.shape[1]
     for k in range(at):
         linkage[k] = joint[Q, k]
-    for b in range(len(mech.dependent)):
+    for b in range(len(dependent)):
         for f in range(basis.shape[1]):
-            linkage[at] = basis[mech.dependent[b], f]
+            linkage[at] = basis[dependent[b], f]
             at += 1
 
 
@@ -327,9 +324,9 @@ def place_block(lanes, step, half_kick, as_pose):
         lanes.residual, lanes.parameter, lanes.step,
     )  # fmt: skip
     run_move(arrays)
-    if lanes.has_closures and step > 0.0:
-        run_correct(arrays)
-    for _ in range(_MAX_CORRECTIONS):
+    for iteration in range(_MAX_CORRECTIONS):
+        if iteration > 0 or (lanes.has_closures and step > 0.0):
+            run_correct(arrays)
         if as_pose:
             run_pose(arrays)
         else:
@@ -339,7 +336,6 @@ def place_block(lanes, step, half_kick, as_pose):
             worst = max(worst, lanes.residual[lane, 0])
         if worst < CLOSURE_TOLERANCE:
             return
-        run_correct(arrays)
 
 
 @compile_without_allocation
@@ -347,29 +343,28 @@ def do_stage(model, sp, z, machines, noise, timing, task, i, stage):
     """Do one stage of a control period of machine i with its Model, Space and state (n,); see `run_stage`."""
     history = machines.history[i]
     row, h = len(history) - 1, timing.period / timing.steps
-    if stage == LOAD:
-        load_linkage(model, sp, machines.linkage[i])
-    elif stage == START:
+    if stage == START:
         before_period(task, model, sp, z, machines, i)
         take_command(history, machines.command[i], timing.max_change)
         sp.time[1] = (machines.period_count[i] - row) * timing.period
         sp.time[0] = sp.time[1] + row * timing.period
         take_commands(model, sp.drive, history, row, 0.0, h, timing.period)
-    elif stage >= FIRST_KICK:
-        set_activations(model, sp, z)
+        return
+    set_activations(model, sp, z)
+    step = stage - FIRST_KICK
+    if step <= timing.steps:
         kick = 0.5 * h
-        if stage > FIRST_KICK:
-            take_commands(model, sp.drive, history, row, (stage - 1) * h, stage * h, timing.period)
+        if step > 0:
+            take_commands(model, sp.drive, history, row, (step - 1) * h, step * h, timing.period)
             advance_oil(model, sp, z, h)
-            sp.time[0] = sp.time[1] + row * timing.period + stage * h
-            if stage < timing.steps:
+            sp.time[0] = sp.time[1] + row * timing.period + step * h
+            if step < timing.steps:
                 kick = h
         add_drive_forces(model, sp, z, kick)
         factorise_cholesky(sp.mass)
         solve_cholesky(sp.mass, sp.force)
         kick_rates(model, sp, z, kick)
-    elif stage == FINISH:
-        set_activations(model, sp, z)
+    else:
         machines.period_count[i] += 1
         sample_readings(model, sp, z, machines, i, noise, machines.period_count[i] * timing.period)
         total = 0.0
@@ -377,8 +372,6 @@ def do_stage(model, sp, z, machines, noise, timing, task, i, stage):
             total += z[k] - z[k]  # not 0 if a state is not finite
         machines.failed[i] = 0 if total == 0.0 else 1
         after_period(task, model, sp, z, machines, i)
-    else:
-        store_linkage(model, sp, machines.linkage[i])
 
 
 @compile_without_allocation
@@ -394,9 +387,8 @@ def run_stage(model, lanes, machines, noise, timing, task, i, lane, stage):
         task: NamedTuple of arrays of the task.
         i: index of the machine.
         lane: its place in the block.
-        stage: LOAD, start of the closures' solution; START, command of the period; FIRST_KICK, half a kick at the
-            start of the period; 1 .. steps, oil and kick of a time step after its positions; FINISH,
-            readings; or STORE, the inverse of LOAD.
+        stage: START, command of the period; FIRST_KICK, half a kick at the start of the period; then oil and
+            kick of each time step after its positions; after the steps, readings.
     """
     mech = model.mech
     own = Model(
@@ -451,27 +443,23 @@ def run_block(model, lanes, machines, noise, timing, task, periods, first, count
         first: index of the first machine.
         count: number of machines, at most that of the lanes; unused lanes compute copies of the last machine.
     """
-    h = timing.period / timing.steps
+    h, dependent = timing.period / timing.steps, model.mech.dependent
     for lane in range(len(lanes.z)):
         i = first + min(lane, count - 1)
         for k in range(lanes.z.shape[1]):
             lanes.z[lane, k] = machines.state[i, k]
         load_parameters(model, lanes, i, lane)
-        run_stage(model, lanes, machines, noise, timing, task, i, lane, LOAD)
+        load_linkage(dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[i])
+    last = FIRST_KICK + timing.steps
     for _ in range(periods):
-        for lane in range(count):
-            run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, START)
-        place_block(lanes, 0.0, 0.25 * h, False)
-        for stage in range(timing.steps + 1):
-            if stage > FIRST_KICK:
-                place_block(lanes, h, 0.5 * h if stage < timing.steps else 0.25 * h, False)
+        for stage in range(last + 2):
+            if stage >= FIRST_KICK:
+                moves, half = FIRST_KICK < stage <= last, 0.5 if FIRST_KICK < stage < last else 0.25
+                place_block(lanes, h if moves else 0.0, half * h, stage > last)
             for lane in range(count):
                 run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, stage)
-        place_block(lanes, 0.0, 0.0, True)
-        for lane in range(count):
-            run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, FINISH)
     for lane in range(count):
-        run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, STORE)
+        store_linkage(dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[first + lane])
         for k in range(lanes.z.shape[1]):
             machines.state[first + lane, k] = lanes.z[lane, k]
 

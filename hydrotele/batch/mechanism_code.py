@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.core.tracing import Program, Value, make_traceable_function, select_below, symbolic_array
+from hydrotele.core.tracing import Program, make_traceable_function, select_below, symbolic_array
 from hydrotele.estimate.reduced_model import (
     Model,
     Space,
@@ -21,7 +21,6 @@ from hydrotele.estimate.reduced_model import (
 )
 from hydrotele.multibody.reduced_dynamics import (
     CLOSURE_TOLERANCE,
-    FRAME_SIZE,
     RATE,
     Q,
     compute_dependent_rates,
@@ -37,6 +36,8 @@ ARRAYS = (
 )  # fmt: skip
 """Arrays of the programs: state, arrays of `Space` and `ReducedMotion`, largest closure residual [m], parameters,
 and (length of the step, half the length of the kick) [s]."""
+PROGRAMS = ("move", "correct", "place", "pose")
+"""Names of the programs of `MechanismCode`."""
 STEP, HALF_KICK = range(2)  # rows of `step`
 SHAPE, JOINT, GRAVITY = range(3)  # sources of parameters
 _MOTION_COLUMNS = 18  # columns of `frame` that a pose has: rotation, origin, spin, velocity
@@ -80,8 +81,9 @@ def array_shapes(model: Model) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays of the programs for one machine, without those of one value per machine."""
     space = model_space(model)
     motion = space.motion
-    found = {name: getattr(motion, name).shape for name in ("joint", "basis", "frame", "bar")}
+    found: dict[str, tuple[int, ...]] = {name: getattr(motion, name).shape for name in ("joint", "basis", "bar")}
     found |= {name: getattr(space, name).shape for name in ("row", "mass", "force", "drive")}
+    found["frame"] = (1 + model.mech.link_count, _MOTION_COLUMNS)
     return {"z": (state_size(model),), **found, "residual": (1,)}
 
 
@@ -181,11 +183,10 @@ class _Tracer:
         names: dict[str, Any] = {"joint": slice(Q, RATE + 1), "basis": mech.dependent, "row": slice(None)}
         names |= {"drive": slice(None), "bar": (slice(None), 0), "residual": slice(None)}
         if as_pose:
-            names["frame"] = (slice(0, 1 + mech.link_count), slice(0, _MOTION_COLUMNS))
+            used["frame"] = used["frame"][: 1 + mech.link_count, :_MOTION_COLUMNS]
+            names["frame"] = slice(None)
         else:
             self._traced(project_mechanism)(model, space, program.load(ARRAYS.index("step"), HALF_KICK))
             names |= {"mass": np.tril_indices(len(used["mass"])), "force": slice(None)}
         return self._store(program, arrays, names)
 
-
-__all__ = ["ARRAYS", "FRAME_SIZE", "MechanismCode", "Value", "array_shapes", "trace_mechanism"]

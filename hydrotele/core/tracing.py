@@ -7,7 +7,9 @@ results are left out. The program is compiled for one machine, or for several at
 
 import hashlib
 import math
+import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -16,7 +18,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from hydrotele.core.device import rebuild_function
+from hydrotele.core.device import import_cuda, rebuild_function
 
 _COMMUTATIVE = {"add", "mul"}
 _INTRINSICS = {"sqrt": "sqrt", "abs": "fabs"}
@@ -80,11 +82,11 @@ class Program:
         return number, *self.operations[number]
 
     def python_source(self, name: str, arrays: Sequence[str]) -> str:
-        """Return the source of a Python function of the arrays, for one machine.
+        """Return the source of a Python function of a tuple of arrays, for one machine.
 
-        The arrays are flat; `math` and `abs` are global variables.
+        `math` is a global variable. The arrays are contiguous, or have one element per row.
         """
-        lines = [f"def {name}({', '.join(arrays)}):"]
+        lines = [f"def {name}(arrays):", f"    {', '.join(arrays)} = [array.reshape(-1) for array in arrays]"]
         for number in self.used_operations():
             kind, *given = self.operations[number]
             words = [f"v{a.number}" if isinstance(a, Value) else repr(a) for a in given]
@@ -317,6 +319,24 @@ def make_program_function(program: Program, lanes: int, wrap: Callable[[Any], An
     function = FunctionType(_call_run.__code__, {"run": run, "__name__": __name__})
     function.__module__, function.__qualname__ = __name__, f"program_{program.digest}_{lanes}"
     return wrap(function)
+
+
+def make_device_program(program: Program, arrays: Sequence[str]) -> Any:
+    """Return the CUDA device function of a tuple of arrays that runs a program for one machine.
+
+    numba's simulator of CUDA runs Python code instead.
+
+    Args:
+        program: the program.
+        arrays: names of its arrays.
+    """
+    cuda = import_cuda()
+    if os.environ.get("NUMBA_ENABLE_CUDASIM") == "1":
+        scope: dict[str, Any] = {"math": math}
+        exec(program.python_source("run_program", arrays), scope)
+        return cuda.jit(device=True)(scope["run_program"])
+    extending = import_module("numba.cuda.extending")
+    return make_program_function(program, 1, cuda.jit(device=True), extending.intrinsic)
 
 
 def _call_run(arrays):
