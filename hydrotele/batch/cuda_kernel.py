@@ -101,7 +101,7 @@ class CudaRunner:
 
     def assign(self, array: Any, values: Any) -> None:
         """Copy values of the CPU or of the device into an array of the device."""
-        if self._cuda.is_cuda_array(values):
+        if hasattr(values, "__cuda_array_interface__"):
             _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
         else:
             array.copy_to_device(np.asfortranarray(np.broadcast_to(np.asarray(values, array.dtype), array.shape)))

@@ -89,7 +89,7 @@ class Program:
         lines = [f"def {name}(arrays):", f"    {', '.join(arrays)} = [array.reshape(-1) for array in arrays]"]
         for number in self.used_operations():
             kind, *given = self.operations[number]
-            words = [f"v{a.number}" if isinstance(a, Value) else repr(a) for a in given]
+            words = [f"v{a.number}" if isinstance(a, Value) else repr(float(a)) for a in given]
             if kind == "load":
                 text = f"{arrays[given[0]]}[{given[1]}]"
             elif kind in _SYMBOLS:
@@ -100,7 +100,8 @@ class Program:
                 text = f"{'' if kind == 'abs' else 'math.'}{kind}({words[0]})"
             lines.append(f"    v{number} = {text}")
         for array, element, value in self.stores:
-            lines.append(f"    {arrays[array]}[{element}] = {f'v{value.number}' if isinstance(value, Value) else value!r}")
+            text = f"v{value.number}" if isinstance(value, Value) else repr(float(value))
+            lines.append(f"    {arrays[array]}[{element}] = {text}")
         return "\n".join(lines) + "\n"
 
     def emit(self, builder: Any, address: Callable[[int, int, int], Any], lanes: int, call: Callable) -> None:
