@@ -12,8 +12,8 @@ from numba.extending import intrinsic
 from hydrotele.batch import machine_step
 from hydrotele.batch.machine_step import Machines, Noise, Timing, make_lanes, store_linkage
 from hydrotele.batch.mechanism_code import PROGRAMS, MechanismCode, trace_mechanism
-from hydrotele.core.device import rebuild_function
 from hydrotele.core.compiled import compile_without_allocation
+from hydrotele.core.device import rebuild_function
 from hydrotele.core.errors import InputError
 from hydrotele.core.tracing import make_program_function
 from hydrotele.estimate.reduced_model import (
@@ -138,7 +138,10 @@ class Batch:
             self._model, self._noise = self._runner.upload(self._model), self._runner.upload(self._noise)
             self._timing, self._arrays = self._runner.upload(self._timing), self._runner.upload(task.arrays)
         else:
-            self._runner, self._arrays = _ThreadRunner(self._single, self._model, task, options.get("threads", 0)), task.arrays
+            self._runner, self._arrays = (
+                _ThreadRunner(self._single, self._model, task, options.get("threads", 0)),
+                task.arrays,
+            )
 
     @property
     def state(self) -> Any:

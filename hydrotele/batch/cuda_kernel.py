@@ -21,6 +21,8 @@ from hydrotele.terms.table import make_law_functions
 from hydrotele.terms.term import Term
 
 THREADS_PER_BLOCK = 64
+
+
 def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> Any:
     """Return the CUDA kernel for machines with the structure of a model.
 
@@ -83,9 +85,7 @@ class CudaRunner:
     def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
         """Launch the kernel; the call does not wait for its end."""
         blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
-        self._kernel[blocks, THREADS_PER_BLOCK](
-            model, machines, noise, timing, arrays, periods, self._parameters
-        )
+        self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods, self._parameters)
 
     def upload(self, record: Any) -> Any:
         """Return a NamedTuple with its arrays copied to the device, nested ones included."""

@@ -30,8 +30,8 @@ from hydrotele.estimate.reduced_model import (
 )
 from hydrotele.multibody.reduced_dynamics import (
     CLOSURE_TOLERANCE,
-    ReducedMotion,
     Q,
+    ReducedMotion,
     factorise_cholesky,
     solve_cholesky,
 )

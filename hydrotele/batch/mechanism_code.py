@@ -95,7 +95,7 @@ class _Tracer:
         self.parameters: dict[tuple[int, int, int], int] = {}
         self._stacked, self._functions = stacked.mech, {}
 
-    def _traced(self, function: Any) -> Any:
+    def _make_traceable(self, function: Any) -> Any:
         return make_traceable_function(function, self._functions)
 
     def _begin(self) -> tuple[Program, Any, Space, dict[str, np.ndarray]]:
@@ -111,7 +111,10 @@ class _Tracer:
         for b in mech.independent:
             used["basis"][b] = space.motion.basis[b]
         motion = space.motion._replace(
-            **{name: getattr(space.motion, name).astype(object) for name in ("jacobian", "momentum", "mass", "loop", "normal")},
+            **{
+                name: getattr(space.motion, name).astype(object)
+                for name in ("jacobian", "momentum", "mass", "loop", "normal")
+            },
             **{name: used[name] for name in ("joint", "basis", "frame", "bar")},
         )
         own = mech._replace(
@@ -145,12 +148,12 @@ class _Tracer:
     def trace_move(self) -> Program:
         program, model, space, arrays = self._begin()
         mech, z, joint = model.mech, arrays["used"]["z"], arrays["used"]["joint"]
-        self._traced(drift_positions)(model, space, z, program.load(ARRAYS.index("step"), STEP))
+        self._make_traceable(drift_positions)(model, space, z, program.load(ARRAYS.index("step"), STEP))
         n, total = len(mech.independent), len(mech.independent) + len(model.transmission)
         for f in range(n):
             joint[RATE, mech.independent[f]] = z[total + f]
         if len(mech.dependent):
-            self._traced(move_coordinates)(mech, space.motion, z, 1)
+            self._make_traceable(move_coordinates)(mech, space.motion, z, 1)
         else:
             joint[Q] = z[:n]
         return self._store(program, arrays, {"z": slice(None), "joint": slice(Q, RATE + 1), "drive": slice(None)})
@@ -161,8 +164,8 @@ class _Tracer:
             return program
         joint = arrays["used"]["joint"]
         before = joint[Q].copy()
-        worst = self._traced(linearise_loops)(model.mech, space.motion)
-        self._traced(correct_dependent_coordinates)(model.mech, space.motion)
+        worst = self._make_traceable(linearise_loops)(model.mech, space.motion)
+        self._make_traceable(correct_dependent_coordinates)(model.mech, space.motion)
         for k in model.mech.dependent:
             joint[Q, k] = select_below(worst, CLOSURE_TOLERANCE, before[k], joint[Q, k])
         return self._store(program, arrays, {"joint": Q})
@@ -171,22 +174,21 @@ class _Tracer:
         program, model, space, arrays = self._begin()
         mech, motion, used = model.mech, space.motion, arrays["used"]
         if len(mech.dependent):
-            used["residual"][0] = self._traced(linearise_loops)(mech, motion)
-            self._traced(compute_dependent_slopes)(mech, motion)
-            self._traced(compute_dependent_rates)(mech, motion)
+            used["residual"][0] = self._make_traceable(linearise_loops)(mech, motion)
+            self._make_traceable(compute_dependent_slopes)(mech, motion)
+            self._make_traceable(compute_dependent_rates)(mech, motion)
         else:
             used["residual"][0] = 0.0
-            self._traced(compute_link_frames)(
+            self._make_traceable(compute_link_frames)(
                 mech.tree, mech.shape, mech.link_count, motion.joint, motion.frame, motion.jacobian
             )
-        self._traced(compute_motion)(model, space, used["z"])
+        self._make_traceable(compute_motion)(model, space, used["z"])
         names: dict[str, Any] = {"joint": slice(Q, RATE + 1), "basis": mech.dependent, "row": slice(None)}
         names |= {"drive": slice(None), "bar": (slice(None), 0), "residual": slice(None)}
         if as_pose:
             used["frame"] = used["frame"][: 1 + mech.link_count, :_MOTION_COLUMNS]
             names["frame"] = slice(None)
         else:
-            self._traced(project_mechanism)(model, space, program.load(ARRAYS.index("step"), HALF_KICK))
+            self._make_traceable(project_mechanism)(model, space, program.load(ARRAYS.index("step"), HALF_KICK))
             names |= {"mass": np.tril_indices(len(used["mass"])), "force": slice(None)}
         return self._store(program, arrays, names)
-

@@ -242,7 +242,7 @@ def _maximum(first: Any, second: Any) -> Any:
     return select_below(first, second, second, first)
 
 
-def _traced(name: str, known: Callable[[float], float]) -> Callable[[Any], Any]:
+def _record_or_compute(name: str, known: Callable[[float], float]) -> Callable[[Any], Any]:
     return lambda value: value.program.record(name, value) if isinstance(value, Value) else known(value)
 
 
@@ -258,7 +258,7 @@ def make_traceable_function(dispatcher: Any, replaced: dict[Any, Any]) -> Any:
     """
     module = ModuleType("math")
     vars(module).update(vars(math))
-    vars(module).update({name: _traced(name, known) for name, known in _NUMBERS.items()})
+    vars(module).update({name: _record_or_compute(name, known) for name, known in _NUMBERS.items()})
     scope = {"math": module, "np": module, "abs": vars(module)["abs"], "min": _minimum, "max": _maximum}
     return rebuild_function(dispatcher, lambda function: function, replaced, modules=scope)
 
