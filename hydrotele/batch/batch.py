@@ -186,6 +186,14 @@ class Batch:
         for array in (m.period_count, m.failed):
             write(array, chosen, 0)
 
+    def synchronise(self) -> None:
+        """Wait until the device has done all steps; `step` does not wait on a CUDA device."""
+        self._runner.synchronise()
+
+    def to_host(self, array: Any) -> np.ndarray:
+        """Return an array of the batch in the memory of the CPU, a copy if the device has its own memory."""
+        return self._runner.read(array)
+
     def expand_parameters(self, name: str) -> Any:
         """Let numbers of the model differ between the machines, and return them.
 
@@ -319,6 +327,9 @@ class _ThreadRunner:
             return
         for done in [self._pool.submit(self._function, *job) for job in jobs]:
             done.result()
+
+    def synchronise(self) -> None:
+        """Return at once: `run` waits for its threads."""
 
     def assign(self, array: np.ndarray, values: Any) -> None:
         """Copy values into an array."""

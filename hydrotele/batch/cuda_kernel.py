@@ -87,6 +87,10 @@ class CudaRunner:
         blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
         self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods, self._parameters)
 
+    def synchronise(self) -> None:
+        """Wait until the device has done all launched kernels."""
+        self._cuda.synchronize()
+
     def upload(self, record: Any) -> Any:
         """Return a NamedTuple with its arrays copied to the device, nested ones included."""
         if isinstance(record, tuple):
