@@ -98,7 +98,7 @@ class _Tracer:
     def _make_traceable(self, function: Any) -> Any:
         return make_traceable_function(function, self._functions)
 
-    def _begin(self) -> tuple[Program, Any, Space, dict[str, np.ndarray]]:
+    def _begin(self) -> tuple[Program, Any, Space, dict[str, Any]]:
         """Return a new program with its model, work space and arrays of loaded values."""
         sizes = [int(np.prod(self.shapes[name])) if name in self.shapes else 0 for name in ARRAYS]
         program, mech = Program(sizes), self.model.mech

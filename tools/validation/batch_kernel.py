@@ -9,11 +9,12 @@ machine code.
 import argparse
 import re
 import time
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numba import types, typeof
+from numba import from_dtype, typeof, types
 
 from hydrotele.batch.batch import NO_TASK, Batch
 from hydrotele.batch.cuda_kernel import make_cuda_kernel
@@ -29,17 +30,15 @@ def device_type(value: Any) -> Any:
         return types.NamedTuple([device_type(part) for part in value], type(value))
     if isinstance(value, np.ndarray):
         layout = "F" if value.ndim > 1 and len(value) > 1 else "C"
-        return types.Array(typeof(value).dtype, value.ndim, layout)
+        return types.Array(from_dtype(value.dtype), value.ndim, layout)
     return typeof(value)
 
 
 def compile_kernel(tool: str) -> dict[str, Any]:
     """Return processor times [s], sizes and nvJitLink's report for the cat215 with a tool."""
     cuda = import_cuda()
-    from cuda.bindings import nvjitlink
-    from numba.cuda import dispatcher
-
-    dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
+    nvjitlink, dispatcher = import_module("cuda.bindings.nvjitlink"), import_module("numba.cuda.dispatcher")
+    setattr(dispatcher, "get_current_device", lambda: SimpleNamespace(compute_capability=CAPABILITY))  # noqa: B010
     machine = load_machine("cat215", tool)
     batch = Batch(machine, 8, threads=1)
     begin = time.process_time()
