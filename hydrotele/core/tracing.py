@@ -21,7 +21,6 @@ from numba.core import cgutils
 from hydrotele.core.device import import_cuda, rebuild_function
 
 _COMMUTATIVE = {"add", "mul"}
-_INTRINSICS = {"sqrt": "sqrt", "abs": "fabs"}
 _SYMBOLS = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 
@@ -97,7 +96,7 @@ class Program:
             elif kind == "keep_below":  # (value, limit, then, otherwise)
                 text = f"{words[2]} if {words[0]} < {words[1]} else {words[3]}"
             else:
-                text = f"{'' if kind == 'abs' else 'math.'}{kind}({words[0]})"
+                text = f"math.{kind}({words[0]})"
             lines.append(f"    v{number} = {text}")
         for array, element, value in self.stores:
             text = f"v{value.number}" if isinstance(value, Value) else repr(float(value))
@@ -154,11 +153,9 @@ class Program:
             elif name == "keep_below":
                 is_below = builder.fcmp_ordered("<", operand(given[0]), operand(given[1]))
                 values[number] = builder.select(is_below, operand(given[2]), operand(given[3]))
-            elif name in _INTRINSICS:
-                suffix = f"v{lanes}f64" if lanes > 1 else "f64"
-                used = cgutils.get_or_insert_function(
-                    builder.module, ir.FunctionType(kind, [kind]), f"llvm.{_INTRINSICS[name]}.{suffix}"
-                )
+            elif name == "sqrt":
+                symbol = f"llvm.sqrt.v{lanes}f64" if lanes > 1 else "llvm.sqrt.f64"
+                used = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), symbol)
                 values[number] = builder.call(used, [operand(given[0])])
             else:
                 values[number] = join([call(name, part) for part in elements(operand(given[0]))])
@@ -246,7 +243,11 @@ def _record_or_compute(name: str, known: Callable[[float], float]) -> Callable[[
     return lambda value: value.program.record(name, value) if isinstance(value, Value) else known(value)
 
 
-_NUMBERS = {"sqrt": math.sqrt, "sin": math.sin, "cos": math.cos, "abs": abs}
+def _magnitude(value: Any) -> Any:
+    return select_below(value, 0.0, -value, value)
+
+
+_FUNCTIONS = {"sqrt": math.sqrt, "sin": math.sin, "cos": math.cos}
 
 
 def make_traceable_function(dispatcher: Any, replaced: dict[Any, Any]) -> Any:
@@ -258,8 +259,8 @@ def make_traceable_function(dispatcher: Any, replaced: dict[Any, Any]) -> Any:
     """
     module = ModuleType("math")
     vars(module).update(vars(math))
-    vars(module).update({name: _record_or_compute(name, known) for name, known in _NUMBERS.items()})
-    scope = {"math": module, "np": module, "abs": vars(module)["abs"], "min": _minimum, "max": _maximum}
+    vars(module).update({name: _record_or_compute(name, known) for name, known in _FUNCTIONS.items()})
+    scope = {"math": module, "np": module, "abs": _magnitude, "min": _minimum, "max": _maximum}
     return rebuild_function(dispatcher, lambda function: function, replaced, modules=scope)
 
 

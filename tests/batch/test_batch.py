@@ -14,12 +14,14 @@ from hydrotele.batch.machine_step import restart_machine
 from hydrotele.batch.measure import compare_with_log
 from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.errors import InputError
+from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.estimate.reduced_model import model_space, predicted_channels, reduced_model, simulate_rows
 from hydrotele.hydraulics.actuator_layout import SLOT_COUNT, Slot
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.sensors import Sensor, SensorError, SensorSet
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
+from hydrotele.terms.term import Term
 
 PERIOD, STEPS = 0.02, 20
 
@@ -33,10 +35,28 @@ def random_commands(rows, axes, seed=0):
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (rows, axes))
 
 
-@pytest.mark.parametrize(("name", "tool"), [("cat215", "none"), ("cat215", "bucket"), ("eha", None), ("rig", None)])
-def test_every_machine_has_the_bits_of_the_reduced_model(name, tool):
+def machine_with_all_states():
+    """A machine with a transmission, bristles, a slow pump and a term."""
+    machine = load_machine("cat215", "none")
+    for name, location in (("presliding", "boom"), ("backlash", "swing"), ("pump_lag", "supply")):
+        found = EFFECTS[name].parameters(machine, location)
+        values = {k: v.start_values[0] if v.start_values else v.nominal + v.prior_std for k, v in found.items()}
+        machine = apply_effect(machine, name, location, values)
+    drag = Term(name="drag", axis="boom", balance="force", law="quadratic_drag", parameters={"coefficient": 2e5})
+    return machine.model_copy(update={"terms": (drag,)})
+
+
+MACHINES = {
+    "open chain": lambda: load_machine("cat215", "none"), "four-bar linkage": lambda: load_machine("cat215", "bucket"),
+    "pump drive": lambda: load_machine("eha"), "no cylinder": lambda: load_machine("emps"),
+    "all states": machine_with_all_states,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_every_machine_has_the_bits_of_the_reduced_model(name):
     """The traced code of eight machines at once rounds as the estimator's functions for one machine."""
-    machine = load_machine(name, tool) if tool else load_machine(name)
+    machine = MACHINES[name]()
     batch = Batch(machine, 10, threads=2)  # one full block and one of two machines
     model = reduced_model(machine, predicted_channels(machine))
     commands = random_commands(26, len(batch.axes))
@@ -171,7 +191,9 @@ from hydrotele.batch import Batch
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.sensors import Sensor, SensorSet
 noisy = SensorSet(angle=Sensor(standard_deviation=1e-3), pressure=Sensor(accuracy=2e4, bits=12, span=40e6))
-machine = load_machine("cat215", "bucket")
+from hydrotele.terms.term import Term
+drag = Term(name="drag", axis="boom", balance="force", law="quadratic_drag", parameters={"coefficient": 2e5})
+machine = load_machine("cat215", "bucket").model_copy(update={"terms": (drag,)})
 cpu, cuda = (Batch(machine, 2, device=d, period=0.003, sensors=noisy, rate_limit=100.0) for d in ("cpu", "cuda"))
 for command in np.random.default_rng(0).uniform(-0.5, 0.5, (2, 2, 4)):
     shown, same = cpu.step(command), cuda.step(command)
