@@ -24,7 +24,7 @@ FLOORS = (
     ("estimate",),
     ("identify",),
     ("simulate", "convert"),
-    ("control",),
+    ("control", "batch"),
     ("teleop",),
     ("haptics",),
     ("run",),

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
+from hydrotele.batch.measure import CPU_COUNTS, CUDA_COUNTS, measure_batch
 from hydrotele.cli.console import make_table, print_json, stderr_console, stdout_console
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_json
@@ -59,6 +60,37 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
         print_json(figures)
         return
     _print(figures, earlier)
+
+
+def run_batch_benchmarks(device: str, machine: str, tool: str | None, quick: bool, as_json: bool) -> None:
+    """Measure batches of the reduced model and print the results.
+
+    Args:
+        device: "cpu" or "cuda".
+        machine: name or folder of the machine.
+        tool: its tool; None for its own.
+        quick: measure for 1 s instead of 5 s per size.
+        as_json: print JSON only.
+
+    Raises:
+        InputError: the device is unknown, or numba-cuda is missing.
+    """
+    if device not in ("cpu", "cuda"):
+        raise InputError("--device", f"must be cpu or cuda, not {device!r}")
+    counts = CUDA_COUNTS if device == "cuda" else CPU_COUNTS
+    figures = measure_batch(load_machine(machine, tool), device, counts, 1.0 if quick else 5.0)
+    if as_json:
+        print_json({"device": device, "machine": machine, "tool": tool, "sizes": figures})
+        return
+    names = {
+        "machines": "machines", "steps_per_s": "1 ms steps/s", "steps_per_core_s": "per s of processor time",
+        "first_step_s": "first step [s]", "bytes_per_machine": "bytes per machine", "failed": "not finite",
+    }  # fmt: skip
+    shown = [name for name in names if name in figures[0]]
+    table = make_table(f"{machine} on {device}", *(names[name] for name in shown))
+    for row in figures:
+        table.add_row(*(f"{row[name]:,}" for name in shown))
+    stdout_console.print(table)
 
 
 def measure_speed(repeats: int) -> dict:

@@ -48,6 +48,14 @@ def _compile_teleoperation() -> None:
     compile_tick_loop()
 
 
+def _compile_batch() -> None:
+    from hydrotele.batch import Batch
+    from hydrotele.machine.machine_file import load_machine
+
+    for tool in ("none", "bucket"):
+        Batch(load_machine("cat215", tool), 8, threads=1).step(None)
+
+
 def _compile_runs() -> None:
     from hydrotele.machine.machine_file import load_machine
     from hydrotele.run.replay import replay_log
@@ -147,6 +155,7 @@ JOBS = (
     Job("analyses", _compile_analyses, 30.0),
     Job("runs", _compile_runs, 15.0),
     Job("haptics", _compile_haptics, 10.0),
+    Job("batches", _compile_batch, 10.0),
     Job("laws", _compile_laws, 5.0),
 )
 

@@ -791,16 +791,27 @@ def experiments(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json")
+@app.command(
+    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json   |   ... --device cpu"
+)
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
     compare: Annotated[Path | None, typer.Option("--compare", help="Compare with the results in this file.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions.")] = False,
+    device: Annotated[
+        str | None,
+        typer.Option("--device", help="Measure batches of the reduced model (hydrotele.batch) on cpu or cuda instead."),
+    ] = None,
+    machine: Annotated[str, typer.Option("--machine", help="Machine of --device.")] = "cat215",
+    tool: Annotated[str | None, typer.Option("--tool", help="Its tool.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up."""
-    from hydrotele.cli.bench_command import run_benchmarks
+    from hydrotele.cli.bench_command import run_batch_benchmarks, run_benchmarks
 
+    if device is not None:
+        run_batch_benchmarks(device, machine, tool, quick, json)
+        return
     run_benchmarks(save, compare, quick, json)
 
 

@@ -458,6 +458,20 @@ def place_mechanism(model, sp, z):
         for f in range(n):
             m.joint[Q, f] = z[f]
         compute_link_frames(mech.tree, mech.shape, mech.link_count, m.joint, m.frame, m.jacobian)
+    compute_motion(model, sp, z)
+
+
+@compile_without_allocation
+def compute_motion(model, sp, z):
+    """Compute the motion of all frames, drive positions and their Jacobian rows, after the frames of the links.
+
+    Args:
+        model: Model.
+        sp: Space; as `place_mechanism`.
+        z: (nz,) state; the positions of drives with a transmission are read.
+    """
+    mech, m = model.mech, sp.motion
+    n, nt = len(mech.independent), m.joint.shape[1]
     compute_link_motion(mech.tree, mech.link_count, m.joint, m.frame, m.jacobian)
     if nt > n:
         compute_drift(mech, m)
@@ -510,11 +524,34 @@ def accelerate(model, sp, z, dt):
 
     Source: linearly implicit midpoint rule.
     """
-    mech, m, user = model.mech, sp.motion, model.user
-    n, t, half = len(mech.independent), len(model.transmission), 0.5 * dt
+    project_mechanism(model, sp, 0.5 * dt)
+    add_drive_forces(model, sp, z, dt)
+    factorise_cholesky(sp.mass)
+    solve_cholesky(sp.mass, sp.force)
+
+
+@compile_without_allocation
+def project_mechanism(model, sp, half):
+    """Write mass matrix and forces of the mechanism with its dampers, in independent coordinates.
+
+    Args:
+        model: Model.
+        sp: Space after `place`; `mass` and `force` are written.
+        half: half the length of the kick, over which the dampers act, scalar [s].
+    """
+    mech, m = model.mech, sp.motion
     compute_mass_and_bias(mech, m)
-    _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
-    first = n + t  # of the rates
+    _project(mech.joint, m.mass, m.joint, m.basis, half, len(mech.independent), sp.mass, sp.force)
+
+
+@compile_without_allocation
+def add_drive_forces(model, sp, z, dt):
+    """Add forces, damping and stiffness of drives, transmissions and end stops to `mass` and `force`.
+
+    The arguments are those of `accelerate`.
+    """
+    user, first = model.user, len(model.mech.independent) + len(model.transmission)  # first of the rates
+    n, half = len(model.mech.independent), 0.5 * dt
     if len(model.terms) > 0:
         for i in range(len(model.gear)):
             sp.drive[V, i] = _drive_velocity(model, sp, z, i)
@@ -564,8 +601,6 @@ def accelerate(model, sp, z, dt):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):
                 sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
-    factorise_cholesky(sp.mass)
-    solve_cholesky(sp.mass, sp.force)
 
 
 @compile_without_allocation
@@ -651,7 +686,7 @@ def arriving(command, row, begin, end, period, delay):
     stop = row + (end - delay) / period
     total, here = 0.0, place
     while here < stop - 1e-9:
-        k = math.floor(here + 1e-9)
+        k = int(math.floor(here + 1e-9))  # CUDA's floor returns a float
         there = min(stop, k + 1.0)
         total += command[min(len(command) - 1, max(0, k))] * (there - here)
         here = there
@@ -681,54 +716,79 @@ def advance(model, sp, z, command, row, period, steps, trail):
 
     Source: velocity Verlet; circuit: `hydraulics.circuit.step_circuit`.
     """
-    total = len(model.mech.independent) + len(model.transmission)
-    nu, count, h = len(model.gear), model.hydraulic, period / steps
-    act, drive, given = sp.act, sp.drive, COMMAND
+    h = period / steps
     sp.time[0] = sp.time[1] + row * period
-    _take_commands(model, drive, command, row, 0.0, h, period)
+    take_commands(model, sp.drive, command, row, 0.0, h, period)
     place(model, sp, z)
     if len(trail) > 0:
         write_trail(model, sp, z, trail[0])
     accelerate(model, sp, z, 0.5 * h)
-    for f in range(total):
-        z[total + f] += 0.5 * h * sp.force[f]
+    kick_rates(model, sp, z, 0.5 * h)
     for step in range(steps):
-        _take_commands(model, drive, command, row, step * h, (step + 1) * h, period)
-        for i in range(nu):
-            drive[V, i] = drive[X, i]
-        for f in range(total):
-            z[f] += h * z[total + f]
+        take_commands(model, sp.drive, command, row, step * h, (step + 1) * h, period)
+        drift_positions(model, sp, z, h)
         place(model, sp, z)
-        for i in range(nu):
-            drive[V, i] = (drive[X, i] - drive[V, i]) / h
-        if model.memory >= 0:
-            _bend(model.user, act, drive, h, sp.act_dot)
-        if count > 0:
-            if len(model.terms) > 0:
-                add_commands(model, sp, h)
-                given = GIVEN
-            first = np.int64(0)  # numba compiles a function anew for a written number
-            drives = Drives(count, act, drive[X], drive[V], drive[given])
-            step_circuit(
-                model.user, first, drives, h, sp.act_dot, sp.scratch, model.terms, sp.time[0],
-                model.memory,
-            )  # fmt: skip
-            if model.memory >= 0 and len(model.terms) > 0:
-                drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
-                write_term_state_rates(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], sp.scratch[FEED:])
-            for k in range(4 * count):
-                act[k] += h * sp.act_dot[k]
-        if model.memory >= 0:
-            for k in range(4 * count, len(sp.act_dot)):
-                act[k] += h * sp.act_dot[k]
-        store_activations(model, sp, z)
+        advance_oil(model, sp, z, h)
         sp.time[0] = sp.time[1] + row * period + (step + 1) * h
         kick = h if step < steps - 1 else 0.5 * h
         accelerate(model, sp, z, kick)
-        for f in range(total):
-            z[total + f] += kick * sp.force[f]
+        kick_rates(model, sp, z, kick)
         if len(trail) > 0:
             write_trail(model, sp, z, trail[step + 1])
+
+
+@compile_without_allocation
+def drift_positions(model, sp, z, h):
+    """Advance the positions of a state by a step h [s]; keep the drives' positions of before as velocities."""
+    total = len(model.mech.independent) + len(model.transmission)
+    for i in range(len(model.gear)):
+        sp.drive[V, i] = sp.drive[X, i]
+    for f in range(total):
+        z[f] += h * z[total + f]
+
+
+@compile_without_allocation
+def kick_rates(model, sp, z, dt):
+    """Advance the rates of a state by the acceleration in `sp.force` over dt [s]."""
+    total = len(model.mech.independent) + len(model.transmission)
+    for f in range(total):
+        z[total + f] += dt * sp.force[f]
+
+
+@compile_without_allocation
+def advance_oil(model, sp, z, h):
+    """Advance the activations of a state by a step, over which the drives' velocities are constant.
+
+    Args:
+        model: Model.
+        sp: Space after `drift_positions` and `place`, with the commands and the time at the step's start.
+        z: (nz,) state, whose activations are advanced.
+        h: step, scalar [s].
+    """
+    act, drive, count, given = sp.act, sp.drive, model.hydraulic, COMMAND
+    for i in range(len(model.gear)):
+        drive[V, i] = (drive[X, i] - drive[V, i]) / h
+    if model.memory >= 0:
+        _bend(model.user, act, drive, h, sp.act_dot)
+    if count > 0:
+        if len(model.terms) > 0:
+            add_commands(model, sp, h)
+            given = GIVEN
+        first = np.int64(0)  # numba compiles a function anew for a written number
+        drives = Drives(count, act, drive[X], drive[V], drive[given])
+        step_circuit(
+            model.user, first, drives, h, sp.act_dot, sp.scratch, model.terms, sp.time[0],
+            model.memory,
+        )  # fmt: skip
+        if model.memory >= 0 and len(model.terms) > 0:
+            drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
+            write_term_state_rates(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], sp.scratch[FEED:])
+        for k in range(4 * count):
+            act[k] += h * sp.act_dot[k]
+    if model.memory >= 0:
+        for k in range(4 * count, len(sp.act_dot)):
+            act[k] += h * sp.act_dot[k]
+    store_activations(model, sp, z)
 
 
 @compile_without_allocation
@@ -742,7 +802,7 @@ def _bend(user, act, drive, h, act_dot):
 
 
 @compile_without_allocation
-def _take_commands(model, drive, command, row, begin, end, period):
+def take_commands(model, drive, command, row, begin, end, period):
     """Commands that arrive over part of a row."""
     for i in range(len(model.delay)):
         if model.delay[i] == 0.0:
@@ -807,6 +867,12 @@ def read_channels(model, sp, z, row, steps, h, trail, out):
     Source: nominal model, "Sensors".
     """
     place(model, sp, z)
+    show_channels(model, sp, z, row, steps, h, trail, out)
+
+
+@compile_without_allocation
+def show_channels(model, sp, z, row, steps, h, trail, out):
+    """Write what the sensors show after `place`; the arguments are those of `read_channels`."""
     for c in range(len(model.kind)):
         if len(trail) > 0 and is_lagged(model, c):
             back = max(0.0, row * steps - model.lag[c] / h)

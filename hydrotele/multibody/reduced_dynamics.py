@@ -188,7 +188,7 @@ def compute_bar_motion(tree, first, frame, bar):
 
 
 _MAX_ITERATIONS = 20  # maximum number of Newton iterations
-_CLOSURE_TOLERANCE = 1.0e-12  # m, maximum residual of a closed loop: rounding of a 10 m machine
+CLOSURE_TOLERANCE = 1.0e-12  # m, maximum residual of a closed loop: rounding of a 10 m machine
 _MAX_INDEPENDENT_STEP = 0.2  # rad or m, maximum step of an independent coordinate between two Newton solutions
 _MAX_DISTANCE = 20.0  # rad or m, distance per call above which steps get larger than _STEP
 _MAX_DEPENDENT_STEP = 0.3  # rad or m, maximum change of a dependent coordinate per Newton iteration
@@ -230,30 +230,72 @@ def close_loops(mech, m, z):
         if move > far:
             far = move
     for part in range(1 + int(min(far, _MAX_DISTANCE) / _MAX_INDEPENDENT_STEP), 0, -1):
-        for f in range(n):
-            move = (z[f] - joint[Q, free[f]]) / part
-            joint[Q, free[f]] += move
-            for b in range(nb):
-                joint[Q, bound[b]] += m.basis[bound[b], f] * move
+        move_coordinates(mech, m, z, part)
         for _ in range(_MAX_ITERATIONS):
-            compute_link_frames(mech.tree, mech.shape, mech.link_count, joint, m.frame, m.jacobian)
-            first = len(mech.tree) - 2 * len(m.loop) // 3
-            worst = _compute_residuals(mech.tree, mech.shape, first, m.frame, m.jacobian, m.loop)
-            _factorise_loops(bound, m.loop, m.normal)
-            if worst < _CLOSURE_TOLERANCE:
+            worst = linearise_loops(mech, m)
+            if worst < CLOSURE_TOLERANCE:
                 break
-            _solve_loops(bound, m.loop, joint.shape[1], m.normal)
-            for b in range(nb):
-                joint[Q, bound[b]] += min(_MAX_DEPENDENT_STEP, max(-_MAX_DEPENDENT_STEP, m.normal[nb, b]))
-        for f in range(n):
-            _solve_loops(bound, m.loop, free[f], m.normal)
-            for b in range(nb):
-                m.basis[bound[b], f] = m.normal[nb, b]
-    for b in range(nb):
-        joint[RATE, bound[b]] = 0.0
-        for f in range(n):
-            joint[RATE, bound[b]] += m.basis[bound[b], f] * joint[RATE, free[f]]
+            correct_dependent_coordinates(mech, m)
+        compute_dependent_slopes(mech, m)
+    compute_dependent_rates(mech, m)
     return worst
+
+
+@compile_without_allocation
+def move_coordinates(mech, m, z, part):
+    """Move the coordinates by 1 / `part` of the distance to the independent positions `z` (n,) [rad] or [m].
+
+    The dependent coordinates move with the slopes in `basis`.
+    """
+    joint, free, bound = m.joint, mech.independent, mech.dependent
+    for f in range(len(free)):
+        move = (z[f] - joint[Q, free[f]]) / part
+        joint[Q, free[f]] += move
+        for b in range(len(bound)):
+            joint[Q, bound[b]] += m.basis[bound[b], f] * move
+
+
+@compile_without_allocation
+def linearise_loops(mech, m):
+    """Compute the frames of the links, the closure residuals, their Jacobian and its factor at positions.
+
+    Returns:
+        Maximum residual of a closure [m].
+    """
+    compute_link_frames(mech.tree, mech.shape, mech.link_count, m.joint, m.frame, m.jacobian)
+    first = len(mech.tree) - 2 * len(m.loop) // 3
+    worst = _compute_residuals(mech.tree, mech.shape, first, m.frame, m.jacobian, m.loop)
+    _factorise_loops(mech.dependent, m.loop, m.normal)
+    return worst
+
+
+@compile_without_allocation
+def correct_dependent_coordinates(mech, m):
+    """Correct the dependent positions by one step of Newton's method, after `linearise_loops`."""
+    bound, nb = mech.dependent, len(mech.dependent)
+    _solve_loops(bound, m.loop, m.joint.shape[1], m.normal)
+    for b in range(nb):
+        m.joint[Q, bound[b]] += min(_MAX_DEPENDENT_STEP, max(-_MAX_DEPENDENT_STEP, m.normal[nb, b]))
+
+
+@compile_without_allocation
+def compute_dependent_slopes(mech, m):
+    """Compute the rates of dependent per independent coordinates (`basis`), after `linearise_loops`."""
+    bound, nb = mech.dependent, len(mech.dependent)
+    for f in range(len(mech.independent)):
+        _solve_loops(bound, m.loop, mech.independent[f], m.normal)
+        for b in range(nb):
+            m.basis[bound[b], f] = m.normal[nb, b]
+
+
+@compile_without_allocation
+def compute_dependent_rates(mech, m):
+    """Compute the rates of the dependent coordinates from those of the independent ones and `basis`."""
+    joint, free, bound = m.joint, mech.independent, mech.dependent
+    for b in range(len(bound)):
+        joint[RATE, bound[b]] = 0.0
+        for f in range(len(free)):
+            joint[RATE, bound[b]] += m.basis[bound[b], f] * joint[RATE, free[f]]
 
 
 @compile_without_allocation

@@ -11,7 +11,8 @@ do not match, as in a file from another process, the term adds nothing.
 
 import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
@@ -101,19 +102,11 @@ def _compile_c_function(law: Law):
     The parameters are the array of `Law.encode_parameters`, and the state the values of a
     `DriveState`. Raise InputError if numba cannot compile a user's law.
     """
-    places, arguments = 1, []
-    for kind in law.kinds.values():
-        if kind is Numbers:
-            arguments.append(f"p[int(p[{places}]) : int(p[{places + 1}])]")
-            places += 2
-        else:
-            arguments.append(f"int(p[{places}])" if kind is Variable else f"p[{places}]")
-            places += 1
     state = ", ".join(f"s[{k}]" for k in range(len(DriveState._fields)))
     text = (
         "def call(parameters, s):\n"
         "    p = carray(parameters, (int(parameters[0]),))\n"
-        f"    return float(function(DriveState({state}), {', '.join(arguments)}))\n"
+        f"    return float(function(DriveState({state}), {law_arguments(law)}))\n"
     )
     own = compiled(law.function) if not law.source else _compile_uncached(law.function)
     names = {"carray": carray, "DriveState": DriveState, "function": own}
@@ -132,6 +125,50 @@ def _compile_c_function(law: Law):
         message = f"cannot be compiled by numba: {' '.join(reasons[:4])}"
         raise InputError(f"{law.source}: law {law.name}", message) from None
     return called
+
+
+def law_arguments(law: Law) -> str:
+    """Return the source text of a law's arguments after the state, from `p`, the array of its parameters."""
+    places, arguments = 1, []
+    for kind in law.kinds.values():
+        if kind is Numbers:
+            arguments.append(f"p[int(p[{places}]) : int(p[{places + 1}])]")
+            places += 2
+        else:
+            arguments.append(f"int(p[{places}])" if kind is Variable else f"p[{places}]")
+            places += 1
+    return ", ".join(arguments)
+
+
+def make_law_functions(terms: Sequence[Term], wrap: Callable[[Any], Any]) -> dict[Any, Any]:
+    """Return forms of functions of this module for processors without function addresses.
+
+    `find_law` and `call_law` then select the laws of some terms by their index in this process's table of laws.
+    Without terms all sums of terms are 0, which saves most of the compile time.
+
+    Args:
+        terms: terms of a machine.
+        wrap: compiles a Python function for the processor; it may refer to compiled functions of this package.
+    """
+    if not terms:
+        sums = {sum_terms: 0.0, sum_terms_with_slope: (0.0, 0.0), sum_flow_terms: (0.0, 0.0, 0.0, 0.0)}
+        functions = {function: wrap(_make_constant_function(value)) for function, value in sums.items()}
+        return functions | {has_term: wrap(lambda terms, balance, axis: False)}
+    lines, scope = ["def call_law(law, terms, at, s):", "    p = terms[at:]"], {}
+    for name in dict.fromkeys(term.law for term in terms):
+        index = law_index(name)
+        scope[f"law_{index}"] = compiled(LAWS[name].function)
+        lines += [f"    if law == {index + 1}:", f"        return law_{index}(s, {law_arguments(LAWS[name])})"]
+    text = "\n".join([*lines, "    return 0.0", f"def find_law(terms, at):\n    return 1 + int(terms[at + {_LAW}])\n"])
+    exec(text, scope)  # generated code, because the number of laws and arguments differs
+    return {find_law: wrap(scope["find_law"]), call_law: wrap(scope["call_law"])}
+
+
+def _make_constant_function(value: Any) -> Any:
+    """Return a function with the arguments of `sum_terms`, or of `sum_flow_terms`, that returns a constant."""
+    if isinstance(value, tuple) and len(value) == 4:
+        return lambda terms, axis, s, drives: value
+    return lambda terms, balance, axis, s, drives: value
 
 
 def _compile_uncached(function):
@@ -247,6 +284,34 @@ def _call_law(typingctx, function, terms, at, state):
         return builder.call(builder.inttoptr(function, kind), [parameters, variables])
 
     return types.float64(function, terms, at, state), codegen
+
+
+@compile_without_allocation
+def find_law(terms, at):
+    """Return the address of a term's law, 0 if this process does not know the law.
+
+    Args:
+        terms: (n,) table of `encode_terms_table`.
+        at: index of the start of the term's row.
+    """
+    place = int(terms[at + _LAW])
+    if place < 0 or place >= _MAX_LAWS:
+        return 0
+    entry = _law_table_address() + 16 * place
+    return _read_int64(entry) if _read_int64(entry + 8) == int(terms[at + _CHECKSUM]) else 0
+
+
+@compile_without_allocation
+def call_law(law, terms, at, state):
+    """Return the value of a law.
+
+    Args:
+        law: result of `find_law`.
+        terms: (n,) table of `encode_terms_table`.
+        at: index of the parameters of the law in `terms`.
+        state: DriveState.
+    """
+    return _call_law(law, terms, at, state)
 
 
 @compile_without_allocation
@@ -443,12 +508,8 @@ def sum_terms(terms, balance, axis, s, drives):
             share *= _hysteresis_state(terms, at, drives)
         if share == 0.0:
             continue
-        place = int(terms[at + _LAW])
-        if place < 0 or place >= _MAX_LAWS:
-            continue
-        entry = _law_table_address() + 16 * place
-        address = _read_int64(entry)
-        if address == 0 or _read_int64(entry + 8) != int(terms[at + _CHECKSUM]):
+        law = find_law(terms, at)
+        if law == 0:
             continue
         seen = s
         played = terms[at + _HYSTERESIS] == PLAY
@@ -471,7 +532,7 @@ def sum_terms(terms, balance, axis, s, drives):
                 let_through,
                 own - let_through,
             )
-        total += share * _call_law(address, terms, int(terms[at + _PARAMETERS]), seen)
+        total += share * call_law(law, terms, int(terms[at + _PARAMETERS]), seen)
     return total
 
 

@@ -1,0 +1,170 @@
+"""Batch on a CUDA device: a kernel with the functions of `machine_step`, one thread per machine.
+
+numba-cuda compiles the same Python functions as those of the CPU; `core.device` makes their CUDA forms. The
+work space of a machine is in the local memory of its thread. Arrays with one row per machine are stored
+column by column, so that neighbouring threads read neighbouring numbers.
+"""
+
+import functools
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hydrotele.batch import machine_step
+from hydrotele.batch.machine_step import Machines, Noise, Timing
+from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode, trace_mechanism
+from hydrotele.core.compiled import cache_folder, source_digest
+from hydrotele.core.device import import_cuda, make_device_function
+from hydrotele.core.output import atomic_file
+from hydrotele.core.tracing import make_device_program
+from hydrotele.estimate.reduced_model import Model
+from hydrotele.terms.law import LAWS
+from hydrotele.terms.table import law_index, make_law_functions
+from hydrotele.terms.term import Term
+
+THREADS_PER_BLOCK = 64
+
+
+def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> Any:
+    """Return the CUDA kernel for machines with the structure of a model.
+
+    Args:
+        model: Model of one machine; the sizes of its work space are constants of the kernel.
+        stacked: Model whose parameters have a leading dimension for the machines.
+        task: `batch.Task`.
+        terms: terms of the machine.
+
+    Returns:
+        (kernel with the arguments (Model, Machines, Noise, Timing, arrays of the task, control periods,
+        `MechanismCode.parameters`), these parameters).
+    """
+    cuda = import_cuda()
+    replaced: dict[Any, Any] = {}
+    replaced |= make_law_functions(terms, lambda function: make_device_function(function, replaced))
+    replaced[machine_step.before_period] = make_device_function(task.before, replaced)
+    replaced[machine_step.after_period] = make_device_function(task.after, replaced)
+    code = trace_mechanism(model, stacked)
+    for name in PROGRAMS:
+        replaced[getattr(machine_step, f"run_{name}")] = make_device_program(getattr(code, name), ARRAYS)
+    lanes = machine_step.make_lanes(model, code, 1)
+    arrays = {name: value for name, value in lanes._asdict().items() if name not in ("source", "has_closures")}
+    scope = {
+        "cuda": cuda, "Lanes": machine_step.Lanes, "real": np.float64,
+        "run_block": make_device_function(machine_step.run_block, replaced),
+    }  # fmt: skip
+    body = [line for name, array in arrays.items() for line in _local_array(name, array)]
+    names = ", ".join(f"{name}={name}" for name in arrays)
+    body += [
+        f"lanes = Lanes({names}, source=source, has_closures={code.has_closures})",
+        "run_block(model, lanes, machines, noise, timing, task, periods, i, 1)",
+    ]
+    head = ["def kernel(model, machines, noise, timing, task, periods, source):", "    i = cuda.grid(1)"]
+    head += ["    if i < machines.state.shape[0]:"]
+    text = "\n".join([*head, *(f"        {line}" for line in body), ""])  # local arrays have constant sizes
+    path = _store_source(text, code, task, terms)
+    exec(compile(text, path or "<kernel of a batch>", "exec"), scope)
+    return cuda.jit(scope["kernel"], cache=path is not None), code.parameters
+
+
+def _store_source(text: str, code: MechanismCode, task: Any, terms: Sequence[Term]) -> str | None:
+    """Write the source of a kernel to the cache folder and return its path; numba-cuda stores the code next to it.
+
+    The name of the folder depends on all that the code depends on. Returns None, for no cache, with laws or tasks
+    of other packages or without a cache folder.
+    """
+    modules = [__name__, *(f.py_func.__module__ for f in (task.before, task.after))]
+    modules += [LAWS[term.law].function.__module__ for term in terms]
+    folder = cache_folder()
+    if folder is None or any(module.partition(".")[0] != "hydrotele" for module in modules):
+        return None
+    parts = [text, *map(source_digest, modules), *(getattr(code, name).digest for name in PROGRAMS)]
+    parts += [f.py_func.__qualname__ for f in (task.before, task.after)] + [repr([term.law for term in terms])]
+    parts += [str([law_index(term.law) for term in terms])]
+    path = folder / f"cuda_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}" / "kernel.py"
+    try:
+        path.parent.mkdir(mode=0o700, exist_ok=True)
+        if not path.exists():
+            with atomic_file(path, ".py") as part:
+                part.write_text(text)
+    except OSError:
+        return None
+    return str(path)
+
+
+def _local_array(name: str, values: np.ndarray) -> list[str]:
+    """Return the source lines that allocate an array with some values in the local memory of a thread."""
+    sizes = tuple(max(1, size) for size in values.shape)  # CUDA has no empty arrays
+    lines, indices = [f"{name} = cuda.local.array({sizes}, real)"], []
+    for depth, size in enumerate(sizes):
+        lines.append(f"{'    ' * depth}for i{depth} in range({size}):")
+        indices.append(f"i{depth}")
+    lines.append(f"{'    ' * len(sizes)}{name}[{', '.join(indices)}] = 0.0")
+    return lines + [f"{name}[{', '.join(map(str, k))}] = {values[tuple(k)]}" for k in np.argwhere(values)]
+
+
+class CudaRunner:
+    """Runs the kernel of a batch on the present CUDA device."""
+
+    def __init__(self, model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> None:
+        """Make the kernel; it is compiled on its first launch."""
+        self._cuda = import_cuda()
+        self._kernel, parameters = make_cuda_kernel(model, stacked, task, terms)
+        self._parameters = self._copy_to_device(parameters)
+
+    def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
+        """Launch the kernel; the call does not wait for its end."""
+        blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
+        self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods, self._parameters)
+
+    def synchronise(self) -> None:
+        """Wait until the device has done all launched kernels."""
+        self._cuda.synchronize()
+
+    def upload(self, record: Any) -> Any:
+        """Return a NamedTuple with its arrays copied to the device, nested ones included."""
+        if isinstance(record, tuple):
+            return record._make(self.upload(part) for part in record)  # pyright: ignore[reportAttributeAccessIssue]
+        return self._copy_to_device(record) if isinstance(record, np.ndarray) else record
+
+    def _copy_to_device(self, array: np.ndarray) -> Any:
+        if array.size == 0:
+            whole = self._cuda.to_device(np.zeros(tuple(max(1, size) for size in array.shape), array.dtype))
+            return whole[tuple(slice(size) for size in array.shape)]
+        return self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+
+    def assign(self, array: Any, values: Any) -> None:
+        """Copy values of the CPU or of the device into an array of the device."""
+        if hasattr(values, "__cuda_array_interface__"):
+            _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
+        else:
+            array.copy_to_device(np.asfortranarray(np.broadcast_to(np.asarray(values, array.dtype), array.shape)))
+
+    def assign_rows(self, array: Any, rows: np.ndarray, values: Any) -> None:
+        """Copy values of the CPU into some rows of an array of the device."""
+        host = array.copy_to_host()
+        host[rows] = values
+        array.copy_to_device(np.asfortranarray(host))
+
+    def read(self, array: Any) -> np.ndarray:
+        """Return a copy of an array in the memory of the CPU."""
+        return array.copy_to_host()
+
+    def repeat(self, values: Any, count: int) -> Any:
+        """Return a device array with one row, repeated."""
+        return self._copy_to_device(np.repeat(values.copy_to_host()[:1], count, axis=0))
+
+
+@functools.cache
+def _copy_values(cuda: Any) -> Any:
+    """Return the kernel that copies a matrix, or one row to all rows, of another layout."""
+
+    @cuda.jit
+    def copy_values(target, source):
+        size = target.shape[0] * target.shape[1]
+        for k in range(cuda.grid(1), size, cuda.gridsize(1)):
+            i, j = k % target.shape[0], k // target.shape[0]
+            target[i, j] = source[i, j] if source.ndim == 2 else source[j]
+
+    return copy_values
