@@ -1,7 +1,7 @@
 """Pages that list every command of hydrotele with its arguments, options and examples."""
 
 import re
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import typer.main
 
@@ -57,11 +57,13 @@ def _option(parameter: Any) -> str:
 
 def _value_name(parameter: Any) -> str:
     annotation = parameter.type_descriptor.annotation
-    text = parameter.metavar or getattr(annotation, "__name__", str(annotation))
-    choices = getattr(annotation, "__args__", ())
+    if get_origin(annotation) is list:
+        annotation = get_args(annotation)[0]
+    choices = get_args(annotation)
     if choices and all(isinstance(choice, str) for choice in choices):
         return " or ".join(f"`{choice}`" for choice in choices)
-    return {"str": "TEXT", "int": "INTEGER", "float": "NUMBER", "Path": "PATH", "list": "..."}.get(text, text)
+    text = parameter.metavar or getattr(annotation, "__name__", str(annotation))
+    return {"str": "TEXT", "int": "INTEGER", "float": "NUMBER", "Path": "PATH"}.get(text, text)
 
 
 def _default(parameter: Any) -> str:

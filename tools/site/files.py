@@ -137,7 +137,7 @@ def _find_entry(facts: dict[str, Any]) -> dict[str, Any]:
 def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], skipped: tuple[str, ...]) -> Section:
     text = schema.get("description", "").strip()
     properties = {key: facts for key, facts in schema.get("properties", {}).items() if key not in skipped}
-    described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), tuple(properties))
+    described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), (*properties, *skipped))
     for key, entry in (KEYS.get("any", {}) | KEYS.get(name, {})).items():
         if key in properties and (key not in described or key in KEYS.get(name, {})):
             described[key] = entry
