@@ -11,7 +11,6 @@ ROOT = DOCS.parent
 sys.path.insert(0, str(ROOT))
 
 import pydantic  # noqa: E402
-from docutils import nodes  # noqa: E402
 
 import hydrotele  # noqa: E402
 from tools.site.repository_pages import find_page  # noqa: E402
@@ -109,6 +108,8 @@ def shorten_signature(app, what, name, value, options, signature, returned):
 
 def replace_double_hyphens(app, doctree) -> None:
     """Write a dash between a parameter of a function and its meaning."""
+    from docutils import nodes
+
     if app.env.docname == "reference/python":
         for text in doctree.findall(lambda node: isinstance(node, nodes.Text) and node.astext() == " -- "):
             text.parent.replace(text, nodes.Text(" – "))
