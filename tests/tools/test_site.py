@@ -66,7 +66,9 @@ def test_a_number_has_its_unit_range_and_default():
     assert values["rated_flow"] == "number [m^3/s], > 0; **required**"
     assert values["rated_pressure_drop"] == "number [Pa], > 0; default `7e+06`"
     assert values["deadband"] == "number [1], ≥ 0, < 1; default `0`"
-    assert values["compensation"] == '`none` or `pressure`; default `"none"`'
+    assert values["compensation"] == '`none`, `pressure`; default `"none"`'
+    (servo,) = (section for section in SECTIONS["scenario_yaml"] if section.name == "Servo")
+    assert {key.name: key.unit for key in servo.keys}["pressure_feedback"] == "1/s"
 
 
 def test_every_channel_is_listed():

@@ -78,13 +78,13 @@ def _default(parameter: Any) -> str:
 
 
 def _escape(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return " ".join(text.split()).replace("\\[", "[").replace("|", "\\|")
 
 
 def _format_epilog(epilog: str) -> list[str]:
     """Return the epilog of a command as Markdown: blocks marked with a backspace keep their lines."""
     parts = []
-    for block in re.split(r"\n\s*\n", epilog.strip("\n")):
+    for block in re.split(r"\n\s*\n", epilog.strip("\n").replace("\\[", "[")):
         is_kept = block.startswith("\b") or parts == []
         lines = block.replace("\b\n", "").replace("\b", "").split("\n")
         if is_kept and EXAMPLE.match(lines[0]):
@@ -92,7 +92,8 @@ def _format_epilog(epilog: str) -> list[str]:
             lines = [word.strip() for line in lines for word in line.split("   |   ")]
             parts.append("```console\n" + "\n".join(lines) + "\n```")
         elif is_kept:
-            parts.append("```text\n" + "\n".join(lines) + "\n```")
+            is_table = any(line.startswith("  ") for line in lines)
+            parts.append("```text\n" + "\n".join(lines) + "\n```" if is_table else " ".join(lines))
         else:
             parts.append(" ".join(" ".join(lines).split()))
     return parts
