@@ -255,28 +255,24 @@ def _describe_default(facts: dict[str, Any]) -> str:
 
 def _describe_values(facts: dict[str, Any]) -> str:
     """Return the valid values of a key: choices or limits, empty without any."""
-    parts = []
+    alternatives = []
     for option in (facts, *facts.get("anyOf", ()), *facts.get("oneOf", ())):
+        parts = [f"`{choice}`" for choice in option.get("enum", ())]
         if "const" in option:
             parts.append(f"`{json.dumps(option['const'])}`")
-        if choices := option.get("enum"):
-            parts.append(", ".join(f"`{choice}`" for choice in choices))
-        limits = []
         for name, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤")):
             if name in option and abs(option[name]) < MAX_MAGNITUDE:
-                limits.append(f"{sign} {option[name]:g}")
-        if limits:
-            parts.append(", ".join(limits))
-        for name, words in (("minItems", "at least"), ("maxItems", "at most")):
-            if name in option and "prefixItems" not in option:
-                parts.append(f"{words} {option[name]} entries")
-        item = option.get("items") or _find_entry(option)
-        if item and (inner := _describe_values(item)):
+                parts.append(f"{sign} {option[name]:g}")
+        if "prefixItems" not in option:
+            for name, words in (("minItems", "at least"), ("maxItems", "at most")):
+                if name in option:
+                    parts.append(f"{words} {option[name]} {'entry' if option[name] == 1 else 'entries'}")
+        items = option.get("items") or next(iter(option.get("prefixItems", ())), None) or _find_entry(option)
+        if items and (inner := _describe_values(items)):
             parts.append(f"each {inner}")
-        firsts = option.get("prefixItems", ())
-        if firsts and (inner := _describe_values(firsts[0])):
-            parts.append(f"each {inner}")
-    return " or ".join(dict.fromkeys(parts))
+        if parts:
+            alternatives.append(", ".join(parts))
+    return " or ".join(dict.fromkeys(alternatives))
 
 
 def format_page(kind: FileKind) -> str:
