@@ -135,6 +135,29 @@ def calibrate_imus(
 
     Raises:
         InputError: logs, machine and poses do not belong together.
+
+    Examples:
+        An IMU on the boom of an excavator, mounted with a rotation of 3 deg that the machine file does not know:
+
+        >>> import math
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> from hydrotele.machine.sensors import MountedSensor, SensorSet
+        >>> def with_imu(rotation):
+        ...     imu = MountedSensor(
+        ...         link="boom", position=(2.5, 0.0, 0.9), rotation=rotation, gyro_noise=0.001, accelerometer_noise=0.02
+        ...     )
+        ...     sensors = {"imu": SensorSet(absent=("length",), mounted={"boom_imu": imu})}
+        ...     return ht.load_machine("cat215").replace("sensors", sensors)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ht.save_machine(with_imu((0.0, math.radians(3.0), 0.0)), Path(folder, "true.yaml"))
+        ...     overrides = {"machine": str(Path(folder, "true.yaml")), "sensors": "imu", "duration": "20"}
+        ...     run = ht.run_scenario(ht.load_scenario("excitation_boom", overrides))
+        ...     ht.save_log(run.measured, Path(folder, "run.parquet"))
+        ...     found = calibrate_imus([Path(folder, "run.parquet")], with_imu((0.0, 0.0, 0.0)), None, [], 0.0)
+        >>> [round(math.degrees(angle), 2) for angle in found.machine.sensors["imu"].mounted["boom_imu"].rotation]
+        [-0.01, 2.98, -0.01]
     """
     logs = [log for run in read_runs(paths, machine, machine.log_columns, False) for log in run.logs]
     logs = [log for log in logs if any(c.startswith("gyro_") for c in log.columns)]

@@ -117,6 +117,29 @@ def identify_linkage(machine: Machine, strokes: AxisStrokes, fixed: Sequence[str
 
     Raises:
         InputError: the axis has no cylinder across its joint, or moves by less than 5 deg.
+
+    Examples:
+        The triangle of the boom cylinders from joint angles and piston displacements:
+
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> from hydrotele.kinematics.drive_linkage import axis_linkage
+        >>> machine = ht.load_machine("cat215", "bucket")
+        >>> triangle, closed = axis_linkage(machine, "boom"), machine.axes["boom"].cylinder.closed_length
+        >>> angle = np.linspace(-0.4, 0.9, 200)
+        >>> measured = triangle.length(angle) - closed + np.random.default_rng(1).normal(0.0, 1e-4, 200)
+        >>> found = identify_linkage(machine, AxisStrokes("boom", angle, measured, 1e-5, 1e-4))
+        >>> for name, value, sd in zip(found.fit.names, found.fit.values, found.fit.standard_deviations):
+        ...     print(f"{name} {value:.3f} +- {sd:.3f}")
+        theta_off 1.373 +- 0.002
+        l_l 0.625 +- 0.000
+        l_c 1.454 +- 0.017
+        l_u 2.007 +- 0.016
+
+        The errors of the parameters are correlated; the predicted displacement is accurate.
+
+        >>> f"{1e3 * found.rms:.2f} mm"  # at samples that were not fitted
+        '0.08 mm'
     """
     linkage = axis_linkage(machine, strokes.axis)
     cylinder = machine.axes[strokes.axis].cylinder

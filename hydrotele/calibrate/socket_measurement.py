@@ -240,6 +240,24 @@ def simulate_sockets(
 
     Raises:
         InputError: too few postures reach a place.
+
+    Examples:
+        A robot holds a ball in two sockets at three places, in 12 postures each. Its links and zero angles have errors,
+        and the ball has 0.1 mm of play. The calibrated robot is tried at a fourth place.
+
+        >>> import numpy as np
+        >>> from hydrotele.calibrate.socket_calibration import SocketOptions, calibrate_sockets, evaluate_robot
+        >>> from hydrotele.kinematics.serial_robot_files import load_robot
+        >>> rng, nominal, errors = np.random.default_rng(3), load_robot("panda"), RobotErrors()
+        >>> true, _ = add_random_errors(nominal, errors, rng)
+        >>> places = {"left": (0.4, 0.3, 0.1), "right": (0.45, -0.3, 0.1), "front": (0.55, 0.0, 0.1)}
+        >>> sockets = simulate_sockets(true, places, 12, errors, rng)
+        >>> found = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid"))
+        >>> unseen = simulate_sockets(true, {"unseen": (0.5, 0.1, 0.25)}, 20, RobotErrors(play=0.0), rng)
+        >>> for robot in nominal, found.robot:
+        ...     print(f"{1e3 * evaluate_robot(robot, unseen).rms:.2f} mm")
+        2.99 mm
+        0.06 mm
     """
     made = []
     for place, first in places.items():

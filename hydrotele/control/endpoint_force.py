@@ -417,6 +417,22 @@ def endpoint_force_of_log(
 
     Raises:
         InputError: a channel is missing, or the tip force of the arm cannot be estimated.
+
+    Examples:
+        The bucket hangs free, so that the true force is zero. The estimate from the pressures and the complete
+        model of the machine shows it. A payload of 500 kg appears as its weight.
+
+        >>> import hydrotele as ht
+        >>> machine = ht.load_machine("cat215", "bucket")
+        >>> for payload in 0.0, 500.0:
+        ...     overrides = {"duration": "3", "sensors": "ideal"}
+        ...     if payload:
+        ...         overrides["effects"] = f"[{{name: payload, location: tool, parameters: {{mass: {payload}}}}}]"
+        ...     run = ht.run_scenario(ht.load_scenario("slow_moves", overrides))
+        ...     force = ht.endpoint_force_of_log(machine, run.measured)
+        ...     print(f"{payload} kg: {round(force['z'][-1] / 1e3)} kN")
+        0.0 kg: 0 kN
+        500.0 kg: -5 kN
     """
     axes = tuple(machine.axes)
     joint = np.column_stack([log[f"{machine.position_kind(a)}.{a}"] for a in axes])

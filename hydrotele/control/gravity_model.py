@@ -220,6 +220,24 @@ def identify_gravity(
             after removing outliers.
 
     Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
+
+    Examples:
+        A slow motion identifies the static moments of an excavator's arm from its pressures. They agree with those
+        that follow from the masses of the machine file.
+
+        >>> import hydrotele as ht
+        >>> from hydrotele.control.gravity_model import fit_gravity_to_masses
+        >>> run = ht.run_scenario(ht.load_scenario("slow_moves", {"duration": "60", "sensors": "ideal"}))
+        >>> machine = run.plant.machine
+        >>> found = ht.identify_gravity(machine, run.measured)
+        >>> for name, value, true in zip(found.names, found.value, fit_gravity_to_masses(machine).value):
+        ...     print(f"{name}: {value / 1e3:.1f} kN m, from the masses {true / 1e3:.1f} kN m")
+        C2: 136.5 kN m, from the masses 136.4 kN m
+        S2: -6.4 kN m, from the masses -5.8 kN m
+        C23: 21.5 kN m, from the masses 21.7 kN m
+        S23: -1.5 kN m, from the masses -1.4 kN m
+        C234: 4.5 kN m, from the masses 4.5 kN m
+        S234: -1.8 kN m, from the masses -1.7 kN m
     """
     moves = extract_slow_motion(machine, log, period)
     size, joints = gravity_parameter_count(moves.angle.shape[1]), moves.angle.shape[1]

@@ -9,6 +9,16 @@ class InputError(ValueError):
     Attributes:
         where: location of the error, from coarse to fine: file, then column, key, row or line.
         message: description of the error and how to correct it.
+
+    Examples:
+        A misspelt name gets the nearest valid one.
+
+        >>> import hydrotele as ht
+        >>> try:
+        ...     ht.load_machine("cat251")
+        ... except ht.InputError as error:
+        ...     print(error.where, "|", error.message.partition(";")[0])
+        machine 'cat251' | is neither a folder with machine.yaml nor a shipped machine
     """
 
     def __init__(self, where: object, message: str) -> None:

@@ -20,6 +20,18 @@ effect of the library; the physics of a new effect needs its own test.
 
 Custom effects need no change to this package. `load_effects` reads a file that defines them, and
 installed packages provide them as entry points of the group `hydrotele.effects`.
+
+Examples:
+    >>> import hydrotele as ht
+    >>> effect = ht.EFFECTS["internal_leakage"]
+    >>> effect.description
+    "leakage between a drive's chambers that differs from the model"
+    >>> machine = ht.load_machine("cat215", "bucket")
+    >>> effect.locations(machine)
+    ('swing', 'boom', 'stick', 'bucket')
+    >>> parameter = effect.parameters(machine, "boom")["leakage"]
+    >>> parameter.unit, parameter.nominal, parameter.upper_bound
+    ('m^3/(s Pa)', 2e-12, 1.0914285714285715e-10)
 """
 
 import hashlib
@@ -240,6 +252,21 @@ def load_effects(path: str | Path) -> tuple[str, ...]:
     Raises:
         InputError: the file cannot be read or run, defines neither effects nor laws, or uses an
             existing name.
+
+    Examples:
+        A file cannot redefine an effect of the library. `Effect` has an example of an effect.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "own.py")
+        ...     _ = path.write_text("from hydrotele import EFFECTS; EFFECT = EFFECTS['payload']")
+        ...     try:
+        ...         ht.load_effects(path)
+        ...     except ht.InputError as error:
+        ...         print(error.message)
+        effect 'payload' exists already; choose another name
     """
     return add_effects_from_file(Path(path), EFFECTS)
 
@@ -259,6 +286,21 @@ def apply_effect(machine: Machine, name: str, location: str, values: Mapping[str
     Raises:
         InputError: the effect, location or a parameter is unknown, a required parameter is missing,
             or a value is out of bounds; the message lists valid values.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> machine = ht.load_machine("rig")
+        >>> worn = ht.apply_effect(machine, "internal_leakage", "slide", {"leakage": 2.0e-12})
+        >>> machine.axes["slide"].cylinder.leakage, worn.axes["slide"].cylinder.leakage  # m^3/(s Pa)
+        (2e-13, 2e-12)
+
+        Errors list the valid values.
+
+        >>> try:
+        ...     ht.apply_effect(machine, "internal_leakage", "boom", {"leakage": 2.0e-12})
+        ... except ht.InputError as error:
+        ...     print(error)
+        effect internal_leakage: has no location 'boom'; valid: slide
     """
     if name not in EFFECTS:
         own = "for a custom effect, name the file that defines it: --effects FILE.py"

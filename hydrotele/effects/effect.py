@@ -34,6 +34,16 @@ class Parameter:
             gradient there is not informative; empty if nominal is a good start value.
         optional: whether the parameter may be omitted when the effect is added to a machine.
             A search that screens many effects omits it, too. An omitted parameter has its nominal value.
+
+    Examples:
+        Bounds and prior of the friction of a cylinder. A change below `min_relevant_change` is not reported.
+
+        >>> import hydrotele as ht
+        >>> friction = ht.EFFECTS["coulomb_friction"].parameters(ht.load_machine("rig"), "slide")["coulomb"]
+        >>> friction.unit, friction.nominal, friction.lower_bound
+        ('N', 150.0, 0.0)
+        >>> round(friction.upper_bound), round(friction.prior_std), round(friction.min_relevant_change, 1)  # N
+        (1557, 352, 17.6)
     """
 
     unit: str
@@ -60,6 +70,25 @@ class Effect:
             With nominal values the returned machine behaves like the given one.
         mechanism: common name of effects that are different forms of one mechanism, such as the
             delay and the lag of one sensor; empty if there is no other form.
+
+    Examples:
+        A custom effect, the mass of a link that differs from the model:
+
+        >>> import hydrotele as ht
+        >>> from hydrotele.effects import Effect, Parameter, with_value
+        >>> def list_links(machine):
+        ...     return tuple(machine.links)
+        >>> def describe_mass(machine, link):
+        ...     mass = machine.links[link].mass
+        ...     return {"mass": Parameter("kg", mass, 0.5 * mass, 2.0 * mass, 0.1 * mass, 0.01 * mass)}
+        >>> def set_mass(machine, link, values):
+        ...     return with_value(machine, f"links.{link}.mass", values["mass"])
+        >>> effect = Effect("link_mass", "mass of a link", "force", list_links, describe_mass, set_mass)
+        >>> machine = ht.load_machine("rig")
+        >>> effect.locations(machine), effect.parameters(machine, "carriage")["mass"].upper_bound
+        (('carriage',), 400.0)
+        >>> effect.apply(machine, "carriage", {"mass": 230.0}).links["carriage"].mass
+        230.0
     """
 
     name: str
@@ -277,6 +306,21 @@ def with_terms(machine: Machine, name: str, terms: Iterable[Term], axes: Iterabl
 
     Returns:
         The changed machine.
+
+    Examples:
+        A force against the motion of the rig's slide that grows with the square of the speed:
+
+        >>> import hydrotele as ht
+        >>> from hydrotele.effects import Term
+        >>> machine = ht.load_machine("rig")
+        >>> drag = Term(
+        ...     name="drag", axis="slide", balance="force", law="quadratic_drag", parameters={"coefficient": 2.0e4}
+        ... )
+        >>> slower = with_terms(machine, "drag", [drag])
+        >>> [term.name for term in machine.terms], [term.name for term in slower.terms]
+        ([], ['drag'])
+        >>> term_parameter(slower, "drag", "slide", "force", "coefficient", 0.0)
+        20000.0
     """
     where = set(machine.axes if axes is None else axes)
     kept = [term for term in machine.terms if term.name != name or term.axis not in where]

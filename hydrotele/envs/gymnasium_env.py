@@ -150,6 +150,28 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         core: the running task with machine, axes, observation fields and variants.
         observation_space: (o,) float32 in SI units; `core.setup.fields` names the values.
         action_space: (a,) float32 from -1 to 1; `core.action_names` names the actions.
+
+    Examples:
+        >>> import gymnasium
+        >>> import hydrotele.envs
+        >>> env = gymnasium.make("hydrotele/TrackTrajectory-v0", variants=1)
+        >>> observation, info = env.reset(seed=1)
+        >>> env.observation_space.shape, env.action_space.shape
+        ((35,), (3,))
+        >>> for _ in range(50):  # one second without any command: the arm stays, and the references move on
+        ...     observation, reward, terminated, truncated, info = env.step([0.0, 0.0, 0.0])
+        >>> sorted(info)
+        ['fault', 'tip_error', 'variant']
+        >>> bool(info["tip_error"] > 0.1)  # m
+        True
+
+        A saved state continues with the same bits.
+
+        >>> saved = env.unwrapped.get_state()
+        >>> once = env.step([0.5, 0.0, 0.0])[0]
+        >>> _ = env.unwrapped.set_state(saved)
+        >>> bool((env.step([0.5, 0.0, 0.0])[0] == once).all())
+        True
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
@@ -304,6 +326,21 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Attributes:
         core: the running task.
+
+    Examples:
+        Each environment of a batch gives the values of a single environment with its seed.
+
+        >>> import gymnasium
+        >>> import numpy as np
+        >>> import hydrotele.envs
+        >>> envs = gymnasium.make_vec("hydrotele/TrackTrajectory-v0", 4, "vector_entry_point", variants=2)
+        >>> env = gymnasium.make("hydrotele/TrackTrajectory-v0", variants=2)
+        >>> observations, infos = envs.reset(seed=5)  # seeds 5, 6, 7, 8
+        >>> observations.shape, bool((observations[2] == env.reset(seed=7)[0]).all())
+        ((4, 35), True)
+        >>> observations, rewards, *_ = envs.step(np.full((4, 3), 0.3))
+        >>> bool(rewards[2] == env.step([0.3, 0.3, 0.3])[1])
+        True
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}

@@ -31,6 +31,19 @@ class ObservationField(NamedTuple):
         unit: SI unit.
         low: lower bound, at which values saturate.
         high: upper bound.
+
+    Examples:
+        >>> import gymnasium
+        >>> import hydrotele as ht
+        >>> import hydrotele.envs
+        >>> env = gymnasium.make("hydrotele/HoldForce-v0", variants=1)
+        >>> fields = {field.name: field for field in env.unwrapped.core.setup.fields}
+        >>> fields["pressure_head.boom"]
+        ObservationField(name='pressure_head.boom', unit='Pa', low=-1000000.0, high=60000000.0)
+
+        A custom task declares its observation with such fields.
+
+        >>> height = ht.ObservationField("height_error", "m", low=-5.0, high=5.0)
     """
 
     name: str

@@ -102,6 +102,24 @@ class TaskState(NamedTuple):
             functions of the task may change them. A task must keep nothing elsewhere, since one object serves
             all episodes, and `get_state` saves these values only.
         measures: (8,) task measures of the step, which `reward` may write; they appear in `info`.
+
+    Examples:
+        A reward that uses the true position and the work of the drives:
+
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> def reward(state, action):
+        ...     error = abs(state.goal[0] - state.true_position[0])
+        ...     return -error - 1e-5 * state.work
+        >>> zero, goal = np.zeros(1), np.zeros(96)
+        >>> goal[0] = 0.30
+        >>> state = ht.TaskState(
+        ...     time=1.0, position=np.array([0.281]), rate=zero, pressure_head=zero, pressure_rod=zero,
+        ...     pressure_supply=zero, tip_pose=np.zeros(5), command=zero, reference=zero,
+        ...     true_position=np.array([0.28]), true_tip=np.zeros(3), work=400.0, goal=goal, measures=np.zeros(8),
+        ... )
+        >>> round(float(reward(state, zero)), 4)  # 20 mm from the goal, and 400 J
+        -0.024
     """
 
     time: float
@@ -141,6 +159,35 @@ class PythonTask:
         ground: whether there is a hard ground.
         servo: gains of the joint servo.
         pose_rates: tip rates at full action: r [m/s], theta [rad/s], z [m/s], attitude, head [rad/s].
+
+    Examples:
+        >>> import gymnasium
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> import hydrotele.envs
+        >>> class MoveSlide(ht.PythonTask):
+        ...     machine, action, duration = "rig", "valve", 2.0
+        ...     observation = (ht.ObservationField("position_error", "m", -1.0, 1.0),)
+        ...     measures = (("position_error", "m"),)
+        ...
+        ...     def reset(self, rng):
+        ...         return [rng.uniform(0.05, 0.45)]  # state.goal[0] of the episode
+        ...
+        ...     def observe(self, state):
+        ...         return [state.goal[0] - state.position[0]]
+        ...
+        ...     def reward(self, state, action):
+        ...         state.measures[0] = abs(state.goal[0] - state.true_position[0])
+        ...         return -state.measures[0]
+        >>> env = gymnasium.make("hydrotele/Custom-v0", task=MoveSlide, variants=1)
+        >>> observation, info = env.reset(seed=1)
+        >>> done = False
+        >>> while not done:
+        ...     action = np.clip(20.0 * observation[-1:], -1.0, 1.0)  # proportional to the position error
+        ...     observation, reward, terminated, truncated, info = env.step(action)
+        ...     done = terminated or truncated
+        >>> bool(info["position_error"] < 0.005)  # m
+        True
     """
 
     description: str = ""

@@ -136,6 +136,28 @@ def find_gap(
     Raises:
         CannotFollowError: the filter of the given machine cannot follow the readings.
         InputError: a custom effect allows no value, or its file raised an error.
+
+    Examples:
+        Two logs of a rig with a friction of 600 N, and a model with 150 N. Two effects are tried instead of all.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> effect = "[{name: coulomb_friction, location: slide, parameters: {coulomb: 600}}]"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "2", "log_rate": "100", "control_rate": "100", "seed": seed}
+        ...         scenario = ht.load_scenario("rig_steps", {**overrides, "effects": effect})
+        ...         run = ht.run_scenario(scenario)
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"))
+        >>> gap = ht.find_gap(data, effects=["coulomb_friction", "valve_gain"], jobs=1)
+        >>> gap.verdict
+        'named'
+        >>> for effect in gap.effects:
+        ...     found = effect.parameters["coulomb"]
+        ...     print(effect.name, effect.location, f"{found.value:.0f} +- {0.5 * (found.high - found.low):.0f} N")
+        coulomb_friction slide 594 +- 8 N
     """
     is_regression = method == "regression"
     begin = time.perf_counter()

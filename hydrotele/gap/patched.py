@@ -48,6 +48,28 @@ def write_patch(gap: Gap, folder: Path) -> None:
     Args:
         gap: what the search yields.
         folder: an existing folder.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> effect = "[{name: coulomb_friction, location: slide, parameters: {coulomb: 600}}]"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "2", "log_rate": "100", "control_rate": "100", "seed": seed}
+        ...         scenario = ht.load_scenario("rig_steps", {**overrides, "effects": effect})
+        ...         run = ht.run_scenario(scenario)
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"))
+        >>> gap = ht.find_gap(data, effects=["coulomb_friction"], jobs=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ht.write_patch(gap, Path(folder))
+        ...     files = sorted(path.name for path in Path(folder).iterdir())
+        ...     patched = ht.load_machine(folder)
+        >>> files
+        ['effects.yaml', 'machine.yaml']
+        >>> round(patched.axes["slide"].cylinder.friction.coulomb, -1)  # N; 150 in the given model
+        590.0
     """
     file = folder / MACHINE_FILE
     save_machine(gap.patched, file)

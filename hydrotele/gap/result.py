@@ -448,6 +448,30 @@ class Gap(Generic[Model]):
         explanation: candidates, rejections and residual inputs; None where no search gives them.
         posterior: samples of the parameters of effects and of calibrated parameters; None without any.
         differences: parameters that differ between runs, and what the held-out run alone has.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> effect = "[{name: coulomb_friction, location: slide, parameters: {coulomb: 600}}]"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "2", "log_rate": "100", "control_rate": "100", "seed": seed}
+        ...         scenario = ht.load_scenario("rig_steps", {**overrides, "effects": effect})
+        ...         run = ht.run_scenario(scenario)
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"))
+        >>> gap = ht.find_gap(data, effects=["coulomb_friction"], jobs=1)
+
+        The patched machine predicts the held-out run almost as well as the noise of the sensors allows: the RMS of
+        the prediction errors, in units of the expected one, falls to about 1.
+
+        >>> gap.size.before > 3.0, gap.size.after < 1.2
+        (True, True)
+        >>> for machine in gap.machine, gap.patched:
+        ...     print(round(machine.axes["slide"].cylinder.friction.coulomb, -1))  # N
+        150.0
+        590.0
     """
 
     machine: Model
@@ -516,6 +540,25 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `initial_regressions`: regressions on measured quantities before the search, `regressions_document`.
         `run_differences`: parameters that differ between runs, fields of `RunDifference`.
         `explanation`: why the verdict, `explanation_document`.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> effect = "[{name: coulomb_friction, location: slide, parameters: {coulomb: 600}}]"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "2", "log_rate": "100", "control_rate": "100", "seed": seed}
+        ...         scenario = ht.load_scenario("rig_steps", {**overrides, "effects": effect})
+        ...         run = ht.run_scenario(scenario)
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"))
+        >>> gap = ht.find_gap(data, effects=["coulomb_friction"], jobs=1)
+        >>> document = ht.gap_document(gap)
+        >>> document["verdict"], [effect["name"] for effect in document["effects"]]
+        ('named', ['coulomb_friction'])
+        >>> document["effects"][0]["parameters"]["coulomb"]["unit"]
+        'N'
     """
     unknown = gap.unknown and {
         "law": gap.unknown.law,

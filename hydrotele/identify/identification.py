@@ -320,6 +320,33 @@ def identify_dynamics(
             period.
 
     Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
+
+    Examples:
+        Mass and friction of the test rig from two simulated runs:
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> from hydrotele.identify.record import build_records
+        >>> from hydrotele.identify.regressor_setup import machine_setup
+        >>> from hydrotele.simulate.closed_loops import load_closed_chain
+        >>> machine = ht.load_machine("rig")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "5", "log_rate": "200", "control_rate": "200", "seed": seed}
+        ...         run = ht.run_scenario(ht.load_scenario("rig_steps", overrides))
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     fit, heldout, notes = build_records(ht.load_dataset(folder, machine))
+        >>> setup = machine_setup(machine, load_closed_chain(machine))
+        >>> found = ht.identify_dynamics(fit, heldout, setup)
+        >>> found.status
+        'ok'
+        >>> for name, unit, value, nominal in zip(found.names, found.units, found.value, found.nominal):
+        ...     if name.startswith(("mass.carriage", "coulomb", "viscous")):
+        ...         print(f"{name} {value:.0f} {unit}, in the machine file {nominal:.0f}")
+        mass.carriage 197 kg, in the machine file 200
+        coulomb.slide_rod 146 N, in the machine file 150
+        viscous.slide_rod 648 N s/m, in the machine file 600
     """
     started, estimator = time.perf_counter(), estimator or Estimator()
     fitted = fit_base_parameters(fit, setup, processing or Processing(), estimator)

@@ -67,6 +67,26 @@ def build_records(
 
     Raises:
         InputError: an axis has a transmission or no position, or no drive has a known force.
+
+    Examples:
+        The force of a drive follows from the pressures of its chambers.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> machine = ht.load_machine("rig")
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "5", "log_rate": "200", "control_rate": "200", "seed": seed}
+        ...         run = ht.run_scenario(ht.load_scenario("rig_steps", overrides))
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     fit, heldout, notes = build_records(ht.load_dataset(folder, machine))
+        >>> [record.name for record in fit], heldout.name, heldout.axes
+        (['run_1'], 'run_2', ('slide',))
+        >>> area = machine.axes["slide"].cylinder
+        >>> head, rod = run.measured["pressure_head.slide"], run.measured["pressure_rod.slide"]
+        >>> bool(abs(heldout.force[:, 0] - (area.area_head * head - area.area_rod * rod)).max() < 1e-6)  # N
+        True
     """
     for axis, facts in dataset.machine.axes.items():
         if facts.transmission:

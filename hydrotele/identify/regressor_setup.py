@@ -195,6 +195,19 @@ def machine_setup(
         The setup. Bodies that no joint moves have no parameters.
 
     Source: Khoshzaban 1992, 4.3 (complete and reduced model) and p. 92, Eq. 4.23 (ball joints).
+
+    Examples:
+        The complete model has the inertia of tubes and rods, the reduced model that of the links only.
+
+        >>> import hydrotele as ht
+        >>> from hydrotele.simulate.closed_loops import load_closed_chain
+        >>> machine = ht.load_machine("cat215", "bucket")
+        >>> chain = load_closed_chain(machine)
+        >>> for model in "complete", "reduced":
+        ...     setup = machine_setup(machine, chain, model)
+        ...     print(model, len(setup.bodies), sum(map(len, (term.nominal for term in setup.friction_terms))))
+        complete 12 11
+        reduced 6 11
     """
     moved = [b for k, b in enumerate(chain.bodies) if chain.tree.is_moved[k + 1].any()]
     bodies = tuple(b for b in moved if model == "complete" or b not in map_cylinder_bodies(machine))

@@ -22,12 +22,33 @@ PLUGIN_GROUP = "hydrotele.importers"
 
 
 class Importer(NamedTuple):
-    """Reader of a file format.
+    r"""Reader of a file format.
 
     Attributes:
         suffixes: ends of the names of its files, in lower case, such as `.acme`.
         read: function of the path that returns a `Recording` with all columns. It raises InputError with file and
             reason if the file cannot be read.
+
+    Examples:
+        An importer of a text format with semicolons and decimal commas. A package offers it as an entry point of
+        the group `hydrotele.importers`.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> def read_bench(path):
+        ...     head, *rows = path.read_text().splitlines()
+        ...     table = np.array([[float(word.replace(",", ".")) for word in row.split(";")] for row in rows])
+        ...     names = head.split(";")
+        ...     return ht.make_recording(path, table[:, 0], dict(zip(names[1:], table.T[1:])), {"pA": "bar"})
+        >>> bench = ht.Importer(suffixes=(".bench",), read=read_bench)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "run.bench")
+        ...     _ = path.write_text("t;pA\n0,00;20,1\n0,01;20,4\n")
+        ...     recording = bench.read(path)
+        >>> recording.groups[0].columns["pA"]
+        array([20.1, 20.4])
     """
 
     suffixes: tuple[str, ...]
@@ -44,6 +65,15 @@ def make_recording(
         time: (n,) time of every row [s].
         columns: name -> (n,) values, NaN where missing.
         units: name -> unit of a column, such as `deg` or `bar`; others are in SI units.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> time = np.arange(5) / 100.0
+        >>> recording = ht.make_recording(Path("a.bench"), time, {"pA": 20.0 + time}, {"pA": "bar"})
+        >>> recording.groups[0].columns["pA"], recording.groups[0].units
+        (array([20.  , 20.01, 20.02, 20.03, 20.04]), {'pA': 'bar'})
     """
     values = {name: np.asarray(column, float) for name, column in columns.items()}
     return Recording(path, [Group(str(path), "", np.asarray(time, float), None, values, dict(units or {}))])

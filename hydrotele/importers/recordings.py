@@ -45,6 +45,18 @@ class Recording:
         notes: one sentence per repair, damaged part or topic that cannot be decoded.
         origin: calendar time of time 0 [ns since 1970], None if unknown.
         metadata: metadata of the file.
+
+    Examples:
+        Topics of a bag have their own times, and become groups:
+
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> fast, slow = np.arange(100) / 100.0, np.arange(10) / 10.0
+        >>> arm = Group("/arm", "JointState", fast, None, {"position": 0.1 * fast}, {"position": "rad"})
+        >>> oil = Group("/oil", "Temperature", slow, None, {"temperature": 45.0 + slow}, {"temperature": "degC"})
+        >>> recording = Recording(Path("field.mcap"), [arm, oil], ignored={"/camera": 30})
+        >>> {group.name: len(group.received) for group in recording.groups}
+        {'/arm': 100, '/oil': 10}
     """
 
     path: Path

@@ -476,6 +476,24 @@ class Dataset:
         notes: one sentence per removed or repaired part of the data.
         unused_channels: one sentence per logged channel that is not used, in all or some runs.
         sensors: name of the sensors of the machine, or None if their noise is unknown.
+
+    Examples:
+        A single log is divided: the last part is held out. A log without a channel is accepted.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> overrides = {"duration": "4", "log_rate": "100", "control_rate": "100"}
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", overrides))
+        >>> columns = {name: values for name, values in run.measured.columns.items() if name != "pressure_rod.slide"}
+        >>> units = {name: run.measured.units[name] for name in columns}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ht.save_log(ht.Log(run.measured.time, columns, units), Path(folder, "run.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"), sensors="laboratory")
+        >>> data.channels
+        ('position.slide', 'length.slide', 'pressure_head.slide', 'pressure_supply')
+        >>> [(part.name, part.start, len(part.command)) for part in (*data.fit, data.heldout)]
+        [('run_1', 0.0, 300), ('run_heldout', 3.0, 100)]
     """
 
     machine: Machine
@@ -528,6 +546,28 @@ def load_dataset(
     Raises:
         InputError: a file is invalid, is from another machine, has no command of an axis or values
             outside the range of the machine, or the runs are too short.
+
+    Examples:
+        Of two runs, one is fitted and one is held out for validation.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for seed in "1", "2":
+        ...         overrides = {"duration": "2", "log_rate": "100", "control_rate": "100", "seed": seed}
+        ...         run = ht.run_scenario(ht.load_scenario("rig_steps", overrides))
+        ...         ht.save_log(run.measured, Path(folder, f"run_{seed}.parquet"))
+        ...     data = ht.load_dataset(folder, ht.load_machine("rig"))
+        >>> [run.name for run in data.fit], data.heldout.name
+        (['run_1'], 'run_2')
+        >>> data.sensors
+        'laboratory'
+        >>> for channel, noise in zip(data.channels[::2], data.noise[::2]):  # standard deviation of a reading
+        ...     print(f"{channel} {noise:.1e}")
+        position.slide 2.9e-05
+        pressure_head.slide 2.9e+04
+        pressure_supply 2.9e+04
     """
     several = [paths] if isinstance(paths, str | Path) else list(paths)
     names = {**machine.log_columns, **(aliases or {})}

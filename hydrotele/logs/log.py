@@ -286,6 +286,26 @@ class Log:
         ValueError: a column has another length than time, no unit, an unknown channel name, or a
             unit that its kind does not allow.
         TypeError: a metadata key or value is not a string.
+
+    Examples:
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> time = np.arange(0.0, 1.0, 0.02)
+        >>> log = ht.Log(time, {"angle.boom": 0.1 * time}, {"angle.boom": "rad"}, {"machine": "cat215"})
+        >>> log
+        Log('memory', 50 rows at 50 Hz, channels=[angle.boom])
+        >>> float(log["angle.boom"][-1].round(3))  # rad
+        0.098
+        >>> log.to_arrow().schema.field("angle.boom").metadata
+        {b'unit': b'rad'}
+
+        A channel name that hydrotele does not know is an error.
+
+        >>> try:
+        ...     ht.Log(time, {"angle_boom": 0.1 * time}, {"angle_boom": "rad"})
+        ... except ValueError as error:
+        ...     print(str(error).partition("?")[0])
+        unknown channel 'angle_boom'; did you mean angle.boom
     """
 
     time: np.ndarray
@@ -390,7 +410,7 @@ def load_log(
     complete: bool = False,
     commands: Mapping[str, CommandRange] | None = None,
 ) -> Log:
-    """Read and check one run from a `.parquet` or `.csv` file or from a run folder.
+    r"""Read and check one run from a `.parquet` or `.csv` file or from a run folder.
 
     Empty cells become NaN, rows may be missing (`Log.gaps` lists them), and time stamps are
     repaired, see `time_stamps.repair_time_stamps`; the notes of the log state the repairs.
@@ -412,6 +432,22 @@ def load_log(
 
     Raises:
         InputError: the file is invalid; the message gives file, column, row and remedy.
+
+    Examples:
+        A CSV file with units in its header is read in SI units.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> rows = "\n".join(f"{0.02 * k:.2f},{10 + k},{80 + k}" for k in range(20))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "run.csv")
+        ...     _ = path.write_text(f"time,angle.boom [deg],pressure_head.boom [bar]\n{rows}\n")
+        ...     log = ht.load_log(path)
+        >>> log.units["pressure_head.boom"], float(log["pressure_head.boom"][0])
+        ('Pa', 8000000.0)
+        >>> round(float(log["angle.boom"][0]), 4)  # rad
+        0.1745
     """
     path = Path(path)
     if path.is_dir():
@@ -506,6 +542,20 @@ def load_logs(
 
     Raises:
         InputError: as for `load_log`; also if the folder has no logs or the same run twice.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> time = np.arange(0.0, 1.0, 0.01)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for name, amplitude in ("a", 0.1), ("b", 0.2):
+        ...         log = ht.Log(time, {"angle.boom": amplitude * np.sin(6 * time)}, {"angle.boom": "rad"})
+        ...         ht.save_log(log, Path(folder, f"{name}.parquet"))
+        ...     logs = ht.load_logs(folder)
+        >>> [(Path(log.source).name, round(float(np.ptp(log["angle.boom"])), 2)) for log in logs]
+        [('a.parquet', 0.2), ('b.parquet', 0.4)]
     """
     path = Path(path)
     found = find_logs(path)
@@ -549,6 +599,29 @@ def save_log(log: Log, path: str | os.PathLike, *, missing: bool = False) -> Non
     Raises:
         InputError: a value is not finite, time does not increase, the name does not end in
             .parquet, or the folder is not writable.
+
+    Examples:
+        The file keeps units and metadata; a reading that is not finite is refused unless `missing` allows it.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> import hydrotele as ht
+        >>> time, pressure = np.arange(0.0, 1.0, 0.02), np.full(50, 8.0e6)
+        >>> pressure[7] = np.nan
+        >>> name = "pressure_head.boom"
+        >>> log = ht.Log(time, {name: pressure}, {name: "Pa"}, {"machine": "cat215"})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "run.parquet")
+        ...     try:
+        ...         ht.save_log(log, path)
+        ...     except ht.InputError as error:
+        ...         print(error.message)
+        ...     ht.save_log(log, path, missing=True)
+        ...     read = ht.load_log(path)
+        is nan: remove the row or enter a value
+        >>> read.metadata["machine"], int(np.isnan(read[name]).sum())
+        ('cat215', 1)
     """
     path = Path(path)
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]

@@ -244,6 +244,23 @@ class Machine(StrictModel):
     positions at home [rad] or [m]. `loads` are the load cylinders of pump axes. `log_columns` maps
     columns of log files to channels. `uncertainty` are standard deviations of parameters by name.
     `terms` are additional force, flow and command laws.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> rig = ht.load_machine("rig")
+        >>> rig.position_kind("slide"), rig.joints["slide"].range
+        ('position', (0.0, 0.5))
+
+        A machine is frozen; `replace` returns a changed copy, and validates it.
+
+        >>> heavy = rig.replace("links.carriage.mass", 400.0)
+        >>> rig.links["carriage"].mass, heavy.links["carriage"].mass
+        (200.0, 400.0)
+        >>> try:
+        ...     rig.replace("links.carriage.mass", -1.0)
+        ... except ht.InputError as error:
+        ...     print(error)
+        links.carriage.mass: cannot be -1.0: Input should be greater than 0
     """
 
     name: Name

@@ -56,7 +56,15 @@ def find_machine_file(name_or_path: str | Path) -> Path:
 
 
 def shipped_machines() -> list[str]:
-    """Return the names of the machines in the package."""
+    """Return the names of the machines in the package.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> ht.shipped_machines()
+        ['calibrator', 'cat215', 'cat325', 'ec20', 'eha', 'emps', 'rig']
+        >>> ht.load_machine("cat325").tools
+        ('none',)
+    """
     return sorted(p.parent.name for p in models_folder().glob(f"*/{MACHINE_FILE}"))
 
 
@@ -72,6 +80,20 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
 
     Raises:
         InputError: the file is invalid; the message gives file, line, key and valid values.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> excavator = ht.load_machine("cat215", tool="bucket")
+        >>> list(excavator.axes)
+        ['swing', 'boom', 'stick', 'bucket']
+        >>> cylinder = excavator.axes["boom"].cylinder
+        >>> round(cylinder.stroke, 3), round(1e4 * cylinder.area_head, 1)  # m, cm^2 of both boom cylinders
+        (1.05, 205.2)
+
+        The relief pressure limits the force that the two boom cylinders can lift with [kN]:
+
+        >>> round(1e-3 * excavator.supply.relief_pressure * cylinder.area_head)
+        574
     """
     return _read_machine(find_machine_file(name_or_path), tool)
 
@@ -111,6 +133,19 @@ def save_machine(machine: Machine, path: str | Path) -> None:
             the file works with any installation. A user MJCF is copied to `<stem>.tree.xml`, with
             meshes, textures and height fields in `<stem>_assets`. User files that define laws of
             terms are copied as well.
+
+    Examples:
+        A changed machine is written to a file and read again.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> worn = ht.load_machine("rig").replace("axes.slide.cylinder.leakage", 2.0e-12)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     ht.save_machine(worn, Path(folder, "worn.yaml"))
+        ...     read = ht.load_machine(Path(folder, "worn.yaml"))
+        >>> read.axes["slide"].cylinder.leakage, read.axes["slide"].cylinder.stroke
+        (2e-12, 0.5)
     """
     machine = _copy_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)

@@ -51,6 +51,22 @@ class PilotState(NamedTuple):
         command: (k,) commands of valves [1], or of drives in their units.
         reference: (k,) positions to follow [rad] or [m]; the start positions without a reference.
         reference_rate: (k,) their rates [rad/s] or [m/s].
+
+    Examples:
+        A proportional controller for the position of a cylinder:
+
+        >>> import numpy as np
+        >>> from hydrotele import PilotState
+        >>> def follow(state):
+        ...     return 8.0 * (state.reference - state.position) + 2.5 * state.reference_rate
+        >>> zero, pressure = np.zeros(1), np.array([5.0e6])
+        >>> state = PilotState(
+        ...     time=0.0, position=np.array([0.20]), rate=zero, pressure_head=pressure, pressure_rod=pressure,
+        ...     pressure_supply=pressure, tip_pose=np.zeros(5), command=zero, reference=np.array([0.22]),
+        ...     reference_rate=np.array([0.04]),
+        ... )
+        >>> follow(state).round(3)  # of the full valve command
+        array([0.26])
     """
 
     time: float
@@ -95,6 +111,28 @@ def allow_policy(name: str, folder: str = "") -> None:
     Args:
         name: as for `load_policy`.
         folder: folder to which a file is relative.
+
+    Examples:
+        A scenario file that names a Python function is refused until the user allows this function.
+
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import hydrotele as ht
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = Path(folder, "half.py").write_text("def half(state): return 0.5 + 0 * state.position")
+        ...     _ = Path(folder, "pull.yaml").write_text(
+        ...         "{name: pull, machine: rig, duration: 0.5, pilot: {kind: policy, policy: half.py:half}}"
+        ...     )
+        ...     scenario = ht.load_scenario(Path(folder, "pull.yaml"))
+        ...     try:
+        ...         ht.run_scenario(scenario)
+        ...     except ht.InputError as error:
+        ...         print(error.where)
+        ...     ht.allow_policy("half.py:half", folder)
+        ...     run = ht.run_scenario(scenario)
+        pilot.policy
+        >>> float(run.measured["command.slide"][-1])
+        0.5
     """
     _ALLOWED.add(_absolute_name(name, folder))
 

@@ -58,6 +58,17 @@ class Replay:
         simulated: the simulated channels at the same times.
         channels: channel name -> difference, for every channel that both logs contain.
         realtime_factor: simulated time divided by computing time [1].
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", {"duration": "1"}))
+        >>> replay = ht.replay_log(run.measured, ht.load_machine("rig"))
+
+        The model is that of the simulation, so that the difference is the noise of the sensors.
+
+        >>> difference = replay.channels["pressure_head.slide"]
+        >>> round(difference.rms / difference.noise_rms, 2)
+        1.06
     """
 
     measured: Log
@@ -107,6 +118,21 @@ def replay_log(
         InputError: a command or position column is missing, samples are missing, the recorded scene
             contained objects, or the initial state violates the closed loops of the machine.
         SimulationFailed: states became infinite or not a number.
+
+    Examples:
+        A log of a cylinder with a friction of 900 N, and a model with 150 N:
+
+        >>> import hydrotele as ht
+        >>> effect = "[{name: coulomb_friction, location: slide, parameters: {coulomb: 900}}]"
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", {"duration": "2", "effects": effect}))
+        >>> model = ht.load_machine("rig")
+        >>> wrong = ht.replay_log(run.measured, model)
+        >>> sticky = ht.apply_effect(model, "coulomb_friction", "slide", {"coulomb": 900})
+        >>> right = ht.replay_log(run.measured, sticky)
+        >>> for replay in wrong, right:
+        ...     print(round(1e-5 * replay.channels["pressure_head.slide"].rms, 2), "bar")
+        3.42 bar
+        0.3 bar
     """
     if not 1e-6 <= timestep < math.inf:
         raise InputError("timestep", f"must be at least 1e-6 s, not {timestep:g}")

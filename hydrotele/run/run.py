@@ -183,6 +183,23 @@ class Run:
         truth: log of the true values, with `initial_state` in its metadata.
         summary: versions, speed, pin openings, balances, tracking errors.
         station: operator station of a teleoperated run, otherwise None.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", {"duration": "1"}))
+        >>> run
+        Run('rig_steps', machine='rig', tool='none', 0.999 s)
+
+        The log of the sensors has noise and quantisation, the log of the truth has neither.
+
+        >>> error = run.measured["pressure_head.slide"] - run.truth["pressure_head.slide"]
+        >>> round(float(error.std()) / 1e5, 2)  # bar; the machine file states an accuracy of 0.5 bar
+        0.28
+
+        The summary contains balances of energy and oil, by which every run checks itself.
+
+        >>> sorted(run.summary["balance"])
+        ['energy_balance', 'flow_balance', 'seconds']
     """
 
     scenario: Scenario
@@ -269,6 +286,20 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
     Raises:
         InputError: the scenario does not fit the machine.
         SimulationFailed: states became infinite or not a number.
+
+    Examples:
+        Half the valve opening moves the cylinder of the test rig at a constant speed. The head side then needs the
+        flow `area * speed`, which the log of the truth contains:
+
+        >>> import hydrotele as ht
+        >>> pilot = "{kind: constant, commands: {slide: 0.5}}"
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", {"duration": "0.8", "pilot": pilot}))
+        >>> speed = float(run.truth["truth.velocity.slide"][-1])
+        >>> area = run.plant.machine.axes["slide"].cylinder.area_head
+        >>> round(speed, 3), round(6e4 * area * speed, 1)  # m/s, L/min
+        (0.249, 18.7)
+        >>> round(6e4 * float(run.truth["truth.flow_head.slide"][-1]), 1)  # L/min
+        18.7
     """
     session = start_session(scenario)
     stride = _PROGRESS_ROWS * session.ticks_per_row

@@ -89,6 +89,18 @@ class Scenario(StrictModel):
     names a sensor set of the machine, and `tool` one of the machine's tools. `oil_temperature` [degC]
     is that during the run; the default is that of the machine's `oil`. `folder` is the folder of
     the scenario file, which is set automatically; relative paths in the scenario start there.
+
+    Examples:
+        A scenario is written in Python with the keys of a scenario file.
+
+        >>> import hydrotele as ht
+        >>> pilot = {"kind": "constant", "commands": {"slide": 0.2}}
+        >>> scenario = ht.Scenario(name="extend", machine="rig", duration=1.0, pilot=pilot)
+        >>> scenario.tick_count, scenario.row_count  # at 200 Hz and 50 Hz
+        (200, 50)
+        >>> speed = ht.run_scenario(scenario).truth["truth.velocity.slide"]
+        >>> round(float(speed[-1]), 3)  # m/s
+        0.097
     """
 
     name: Name
@@ -145,7 +157,15 @@ class Scenario(StrictModel):
 
 
 def shipped_scenarios() -> list[str]:
-    """Return the sorted names of the scenarios that the package contains: file names without `.yaml`."""
+    """Return the sorted names of the scenarios that the package contains: file names without `.yaml`.
+
+    Examples:
+        >>> import hydrotele as ht
+        >>> [name for name in ht.shipped_scenarios() if name.startswith("rig")]
+        ['rig_steps']
+        >>> ht.load_scenario("rig_steps").description
+        'Laboratory rig, valve steps of rising size in both directions, open loop'
+    """
     return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
 
 
@@ -207,6 +227,19 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
 
     Raises:
         InputError: the file is not valid; the message names file, line, key path and valid values.
+
+    Examples:
+        Overrides have the form of `--set`: a key path and YAML text.
+
+        >>> import hydrotele as ht
+        >>> scenario = ht.load_scenario("rig_steps", {"duration": "2", "sensors": "ideal"})
+        >>> scenario.machine, scenario.duration, scenario.row_count
+        ('rig', 2.0, 2000)
+        >>> try:
+        ...     ht.load_scenario("rig_steps", {"duration": "-2"})
+        ... except ht.InputError as error:
+        ...     print(error.message)
+        duration: Input should be greater than 0
     """
     return make_scenario(read_scenario_file(name_or_path), overrides)
 

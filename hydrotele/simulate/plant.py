@@ -161,6 +161,18 @@ class Plant:
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
         extra_states: name of each additional state (`actuator_layout.extra_state_names`) -> its
             index in `act`.
+
+    Examples:
+        >>> import mujoco
+        >>> import hydrotele as ht
+        >>> plant = ht.build_plant(ht.load_machine("rig"))
+        >>> data = ht.rest_state(plant)
+        >>> data.ctrl[0] = 0.5  # half opening of the valve of `slide`
+        >>> mujoco.mj_step(plant.model, data, nstep=500)  # 0.5 s
+        >>> float(plant.spools(data)[0].round(3))
+        0.5
+        >>> (plant.pressures(data)[0] / 1e5).round(1)  # bar, head and rod side
+        array([28.7, 43.3])
     """
 
     machine: Machine
@@ -256,6 +268,16 @@ def build_plant(
     Raises:
         InputError: the MJCF cannot be assembled.
         RuntimeError: the native hydraulics cannot run with this MuJoCo.
+
+    Examples:
+        The model is a plain MuJoCo model, with tube and rod of every cylinder as bodies.
+
+        >>> import hydrotele as ht
+        >>> plant = ht.build_plant(ht.load_machine("cat215", "bucket"))
+        >>> plant.axes, plant.model.nu, plant.model.na  # four activations per hydraulic axis
+        (('swing', 'boom', 'stick', 'bucket'), 4, 16)
+        >>> plant.model.opt.timestep, plant.model.body("boom_rod").name
+        (0.001, 'boom_rod')
     """
     install_hydraulics()
     model = compile_mechanism(machine, timestep, ground, visuals=False, surroundings=surroundings)
@@ -320,6 +342,19 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
 
     Raises:
         InputError: the linkages do not close at this position.
+
+    Examples:
+        The head pressure of the boom cylinders carries the arm; stretching the arm raises it.
+
+        >>> import hydrotele as ht
+        >>> plant = ht.build_plant(ht.load_machine("cat215", "bucket"))
+        >>> boom = plant.axes.index("boom")
+        >>> for stick in -2.4, -0.6:
+        ...     data = ht.rest_state(plant, {"stick": stick})
+        ...     reach = plant.tip(data)[0][0]
+        ...     print(f"tip {reach:.1f} m ahead: {plant.pressures(data)[boom, 0] / 1e5:.0f} bar")
+        tip 3.0 m ahead: 111 bar
+        tip 7.1 m ahead: 143 bar
     """
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
@@ -359,6 +394,20 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
 
     Raises:
         InputError: the linkages do not close at this position.
+
+    Examples:
+        The state at the start of a logged run:
+
+        >>> import json
+        >>> import hydrotele as ht
+        >>> run = ht.run_scenario(ht.load_scenario("rig_steps", {"duration": "0.5"}))
+        >>> start = json.loads(run.truth.metadata["initial_state"])
+        >>> start["order"], start["angle"]
+        (['slide'], [0.1])
+        >>> plant = ht.build_plant(ht.load_machine("rig"))
+        >>> data = ht.initial_state(plant, start)
+        >>> (plant.pressures(data)[0] / 1e5).round(1)  # bar
+        array([20. , 32.8])
     """
     order = list(state["order"])
     joints = {plant.machine.axes[n].joint: v for n, v in zip(order, state["angle"], strict=True)}

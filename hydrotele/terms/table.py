@@ -127,8 +127,9 @@ def _compile_c_function(law: Law):
     except Exception as error:  # numba raises many types for an invalid user function
         if not law.source:
             raise
-        why = str(error).strip().splitlines()
-        message = f"cannot be compiled by numba: {why[0]} ... {why[-1]}"
+        why = [line.strip() for line in str(error).splitlines() if line.strip()]
+        reasons = [line for line in why if not line.startswith(("Failed in", "During", "File", "<source", "^"))]
+        message = f"cannot be compiled by numba: {' '.join(reasons[:4])}"
         raise InputError(f"{law.source}: law {law.name}", message) from None
     return called
 

@@ -29,7 +29,37 @@ from hydrotele.scenario.scenario import Servo
 
 
 class Controller(Protocol):
-    """Interface of a controller, which computes actions from observations for n parallel episodes."""
+    """Interface of a controller, which computes actions from observations for n parallel episodes.
+
+    Examples:
+        A proportional controller of axis rates for `TrackTrajectory`:
+
+        >>> import gymnasium
+        >>> import hydrotele.envs
+        >>> class RateController:
+        ...     def __init__(self, setup):
+        ...         names = [field.name for field in setup.fields]
+        ...         axes = ("swing", "boom", "stick")
+        ...         self.measured = [names.index(f"angle.{axis}") for axis in axes]
+        ...         self.reference = [names.index(f"reference.{axis}") for axis in axes]
+        ...
+        ...     def begin(self, count):
+        ...         pass  # it keeps no state
+        ...
+        ...     def reset(self, mask):
+        ...         pass
+        ...
+        ...     def __call__(self, observation):
+        ...         return 5.0 * (observation[:, self.reference] - observation[:, self.measured])
+        >>> env = gymnasium.make("hydrotele/TrackTrajectory-v0", variants=1, duration=4.0, action="joint_rate")
+        >>> controller = RateController(env.unwrapped.core.setup)
+        >>> controller.begin(1)
+        >>> (observation, info), over = env.reset(seed=1), False
+        >>> while not over:
+        ...     observation, reward, _, over, info = env.step(controller(observation[None])[0])
+        >>> bool(info["tip_error"] < 0.5)  # m
+        True
+    """
 
     def begin(self, count: int) -> None:
         """Allocate and initialise the controller state for `count` parallel episodes."""
