@@ -136,7 +136,7 @@ def _find_entry(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], skipped: tuple[str, ...]) -> Section:
-    text = schema.get("description", "").strip()
+    text = schema.get("description", "").partition("\nExamples:")[0].strip()
     properties = {key: facts for key, facts in schema.get("properties", {}).items() if key not in skipped}
     itemised = tuple(properties.keys() - KEYS.get(name, {}).keys())
     described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), (*properties, *skipped), itemised)
