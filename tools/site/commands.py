@@ -1,7 +1,7 @@
 """Pages that list every command of hydrotele with its arguments, options and examples."""
 
 import re
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import typer.main
 
@@ -57,11 +57,13 @@ def _option(parameter: Any) -> str:
 
 def _value_name(parameter: Any) -> str:
     annotation = parameter.type_descriptor.annotation
-    text = parameter.metavar or getattr(annotation, "__name__", str(annotation))
-    choices = getattr(annotation, "__args__", ())
+    if get_origin(annotation) is list:
+        annotation = get_args(annotation)[0]
+    choices = get_args(annotation)
     if choices and all(isinstance(choice, str) for choice in choices):
         return " or ".join(f"`{choice}`" for choice in choices)
-    return {"str": "TEXT", "int": "INTEGER", "float": "NUMBER", "Path": "PATH", "list": "..."}.get(text, text)
+    text = parameter.metavar or getattr(annotation, "__name__", str(annotation))
+    return {"str": "TEXT", "int": "INTEGER", "float": "NUMBER", "Path": "PATH"}.get(text, text)
 
 
 def _default(parameter: Any) -> str:
@@ -76,13 +78,13 @@ def _default(parameter: Any) -> str:
 
 
 def _escape(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return " ".join(text.split()).replace("\\[", "[").replace("|", "\\|")
 
 
 def _format_epilog(epilog: str) -> list[str]:
     """Return the epilog of a command as Markdown: blocks marked with a backspace keep their lines."""
     parts = []
-    for block in re.split(r"\n\s*\n", epilog.strip("\n")):
+    for block in re.split(r"\n\s*\n", epilog.strip("\n").replace("\\[", "[")):
         is_kept = block.startswith("\b") or parts == []
         lines = block.replace("\b\n", "").replace("\b", "").split("\n")
         if is_kept and EXAMPLE.match(lines[0]):
@@ -90,7 +92,8 @@ def _format_epilog(epilog: str) -> list[str]:
             lines = [word.strip() for line in lines for word in line.split("   |   ")]
             parts.append("```console\n" + "\n".join(lines) + "\n```")
         elif is_kept:
-            parts.append("```text\n" + "\n".join(lines) + "\n```")
+            is_table = any(line.startswith("  ") for line in lines)
+            parts.append("```text\n" + "\n".join(lines) + "\n```" if is_table else " ".join(lines))
         else:
             parts.append(" ".join(" ".join(lines).split()))
     return parts

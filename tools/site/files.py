@@ -64,6 +64,7 @@ SENTENCE = re.compile(r"(?<=[.:])\s+(?=[A-Z`])")
 ATTRIBUTE = re.compile(r"^ {4}(?P<key>\w+): (?P<text>.*(?:\n {8}.*)*)", re.M)
 MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc__ or "").partition("\n\n")[2]}
 """Class name -> text that also describes its keys."""
+ITEM = re.compile(r"- (?P<names>`\w+`(?:, `\w+`)*)(?P<unit> \[[^\]]*\](?: or \[[^\]]*\])?)?: (?P<text>.*)")
 UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
 STATED_UNIT = re.compile(rf"\s*{UNIT.replace('?P<unit>', '').replace('?P<other>', '')}")
 NOT_UNITS = ("low", "values", "mean", "x", "command_unit")
@@ -135,9 +136,10 @@ def _find_entry(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], skipped: tuple[str, ...]) -> Section:
-    text = schema.get("description", "").strip()
+    text = schema.get("description", "").partition("\nExamples:")[0].strip()
     properties = {key: facts for key, facts in schema.get("properties", {}).items() if key not in skipped}
-    described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), tuple(properties))
+    itemised = tuple(properties.keys() - KEYS.get(name, {}).keys())
+    described, prose = split_docstring(text + MORE_DOCSTRINGS.get(name, ""), (*properties, *skipped), itemised)
     for key, entry in (KEYS.get("any", {}) | KEYS.get(name, {})).items():
         if key in properties and (key not in described or key in KEYS.get(name, {})):
             described[key] = entry
@@ -156,11 +158,12 @@ def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], ski
     return Section(name, paths, prose, keys)
 
 
-def split_docstring(text: str, keys: tuple[str, ...]) -> tuple[dict[str, str], str]:
+def split_docstring(text: str, keys: tuple[str, ...], itemised: tuple[str, ...]) -> tuple[dict[str, str], str]:
     """Split a docstring into the meaning of each key, and the remaining text.
 
     A key is described by its line below `Attributes:`, by its item of a list, or by the sentences that name it in
-    backticks. The summary is part of the remaining text.
+    backticks and those that follow in the paragraph. The summary is part of the remaining text. `itemised` are the keys
+    that items of lists may describe.
     """
     summary, _, rest = text.partition("\n\n")
     described: dict[str, str] = {}
@@ -171,23 +174,31 @@ def split_docstring(text: str, keys: tuple[str, ...]) -> tuple[dict[str, str], s
             described[match["key"]] = " ".join(match["text"].split())
     for block in re.split(r"\n\s*\n|\n(?=- )", rest):
         words = " ".join(block.split())
-        names, colon, meaning = words.removeprefix("- ").partition(":")
-        if words.startswith("- ") and colon and any(f"`{key}`" in names for key in keys):
-            for key in keys:
-                if f"`{key}`" in names:
-                    unit = re.search(r"\[.*", names)
-                    described.setdefault(key, f"{unit[0] + ' ' if unit else ''}{meaning.strip()}")
-            continue
+        if item := ITEM.fullmatch(words):
+            names = [name for name in re.findall(r"`(\w+)`", item["names"]) if name in itemised]
+            described |= {name: f"{item['unit'] or ''} {item['text']}".strip() for name in names}
+            if names:
+                continue
         if words.startswith("- "):
-            prose.append("\n" + words)
+            prose.append(words)
             continue
+        mentioned: list[str] = []
         for sentence in filter(None, SENTENCE.split(words)):
-            mentioned = [key for key in keys if re.search(rf"`{key}[`:]", sentence)]
+            mentioned = [key for key in keys if re.search(rf"`{key}[`:]", sentence)] or mentioned
             for key in mentioned:
                 described[key] = f"{described[key]} {sentence}" if key in described else sentence
             if not mentioned:
                 prose.append(sentence)
-    return described, "\n".join(prose)
+    return described, _join_prose(prose)
+
+
+def _join_prose(parts: list[str]) -> str:
+    """Return sentences and items of lists as Markdown."""
+    text = parts[0]
+    for before, part in zip(parts, parts[1:], strict=False):
+        is_item, was_item = part.startswith("- "), before.startswith("- ")
+        text += ("\n\n" if is_item != was_item else "\n") + part
+    return text
 
 
 def find_unit(key: str, meaning: str, text: str) -> str:
@@ -237,34 +248,31 @@ def _describe_default(facts: dict[str, Any]) -> str:
         return "none"
     if isinstance(default, float):
         return f"`{default:g}`"
-    if isinstance(default, dict) and default:
-        return "its defaults"
+    if isinstance(default, dict):  # the defaults of its keys
+        return "none"
     return f"`{json.dumps(default)}`"
 
 
 def _describe_values(facts: dict[str, Any]) -> str:
     """Return the valid values of a key: choices or limits, empty without any."""
-    parts = []
+    alternatives = []
     for option in (facts, *facts.get("anyOf", ()), *facts.get("oneOf", ())):
+        parts = [f"`{choice}`" for choice in option.get("enum", ())]
         if "const" in option:
             parts.append(f"`{json.dumps(option['const'])}`")
-        parts += [f"`{json.dumps(value)}`".replace('"', "") for value in option.get("enum", ())]
-        limits = []
         for name, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤")):
             if name in option and abs(option[name]) < MAX_MAGNITUDE:
-                limits.append(f"{sign} {option[name]:g}")
-        if limits:
-            parts.append(", ".join(limits))
-        for name, words in (("minItems", "at least"), ("maxItems", "at most")):
-            if name in option and "prefixItems" not in option:
-                parts.append(f"{words} {option[name]} entries")
-        item = option.get("items") or _find_entry(option)
-        if item and (inner := _describe_values(item)):
+                parts.append(f"{sign} {option[name]:g}")
+        if "prefixItems" not in option:
+            for name, words in (("minItems", "at least"), ("maxItems", "at most")):
+                if name in option:
+                    parts.append(f"{words} {option[name]} {'entry' if option[name] == 1 else 'entries'}")
+        items = option.get("items") or next(iter(option.get("prefixItems", ())), None) or _find_entry(option)
+        if items and (inner := _describe_values(items)):
             parts.append(f"each {inner}")
-        firsts = option.get("prefixItems", ())
-        if firsts and (inner := _describe_values(firsts[0])):
-            parts.append(f"each {inner}")
-    return " or ".join(dict.fromkeys(parts))
+        if parts:
+            alternatives.append(", ".join(parts))
+    return " or ".join(dict.fromkeys(alternatives))
 
 
 def format_page(kind: FileKind) -> str:
@@ -285,7 +293,9 @@ def format_page(kind: FileKind) -> str:
         parts.append(section.text)
         rows = ["| key | value | meaning |", "| --- | --- | --- |"]
         for key in section.keys:
-            meaning = key.description if f"`{key.name}`" in key.description else STATED_UNIT.sub("", key.description)
+            meaning = key.description
+            if key.unit and f"`{key.name}`" not in meaning:  # the column of values has the unit
+                meaning = STATED_UNIT.sub("", meaning, count=1)
             rows.append(f"| `{key.name}` | {format_value(key)} | {escape(meaning)} |")
         parts.append("\n".join(rows))
     return "\n\n".join(part for part in parts if part) + "\n"
