@@ -73,6 +73,7 @@ class TrainingState:
         seconds: duration so far [s].
         curve: rows (steps, seconds, difficulty, mean return of training episodes, mean return and share
             of successful episodes of the evaluation; NaN where there is none).
+        processor_seconds: processor time so far [s], with the evaluations.
         reward_scale: variance, mean and count of the discounted returns, which scale the rewards.
     """
 
@@ -80,6 +81,7 @@ class TrainingState:
     steps: int = 0
     seconds: float = 0.0
     curve: list[list[float]] = dataclasses.field(default_factory=list)
+    processor_seconds: float = 0.0
     reward_scale: tuple[float, float, float] | None = None
 
     def save(self, folder: Path) -> None:
