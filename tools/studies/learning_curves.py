@@ -44,8 +44,9 @@ def make_row(task: str, result: dict) -> str:
     shown = f"{share['value']:.2f} ({share['low']:.2f} to {share['high']:.2f})" if share else "-"
     success = scores["policy"]["success"]
     options = ", ".join(f"{key} {value}" for key, value in result["options"].items())
-    cells = [task, options, f"{result['steps']:,}", f"{result['seconds'] / 60.0:.0f}", cell("policy"), cell("zero"),
-             cell("reference"), shown, "-" if success is None else f"{success:.2f}"]  # fmt: skip
+    cells = [task, options, f"{result['steps']:,}", f"{result['processor_seconds'] / 60.0:.1f}",
+             f"{result['seconds'] / 60.0:.1f}", cell("policy"), cell("zero"), cell("reference"), shown,
+             "-" if success is None else f"{success:.2f}"]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
 
@@ -76,8 +77,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     results = {}
-    print("| task | environment options | steps | minutes | policy return | zero | reference | share (95 % interval) "
-          "| success |\n| " + "--- | " * 9)  # fmt: skip
+    print("| task | environment options | steps | processor time [min] | elapsed time [min] | policy return | zero "
+          "| reference | share (95 % interval) | success |\n| " + "--- | " * 10)  # fmt: skip
     for task in asked.tasks:
         results[task] = train_task(task, asked)
         print(make_row(task, results[task]), flush=True)
