@@ -16,6 +16,9 @@ POLICY_FILE, STATE_FILE, CURVE_FILE = "policy.zip", "training.json", "learning_c
 RECIPES: dict[str, dict[str, Any]] = {
     "TrackTrajectory": {"action": "joint_rate", "control_rate": 25.0},
     "ReachFeller": {"action": "resolved_motion", "control_rate": 10.0},
+    "Grade": {"control_rate": 10.0},  # the discount factor of 0.98 then spans 5 s, a stroke of the bucket
+    "PlaceLog": {"control_rate": 10.0},
+    "LoadTruck": {"control_rate": 10.0},
 }
 """Task name -> options of the environment with which a policy is trained by default."""
 DEFAULT_RECIPE: dict[str, Any] = {"control_rate": 25.0}

@@ -51,16 +51,16 @@ def make_row(task: str, result: dict) -> str:
 
 
 def draw_curves(results: dict[str, dict], asked: argparse.Namespace) -> None:
-    """Draw the share of the advantage against the training time for every task."""
+    """Draw the share of the advantage against the environment steps for every task."""
     figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
     for task, result in results.items():
         if "reference" not in result["scores"]:
             continue
         zero, reference = (result["scores"][name]["return"] for name in ("zero", "reference"))
         rows = np.genfromtxt(asked.out / task / "learning_curve.csv", delimiter=",", names=True)
-        axes.plot(rows["seconds"] / 60.0, (rows["return"] - zero) / (reference - zero), "o-", ms=3, label=task)
+        axes.plot(rows["steps"] / 1e3, (rows["return"] - zero) / (reference - zero), "o-", ms=3, label=task)
     axes.axhline(0.5, color="0.6", ls="--")
-    axes.set(xlabel="training time [min]", ylabel="share of the reference's advantage [1]", ylim=(-0.2, 1.1))
+    axes.set(xlabel="environment steps [1000]", ylabel="share of the reference's advantage [1]", ylim=(-0.2, 1.1))
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(asked.out / "learning_curves.png", dpi=100)
