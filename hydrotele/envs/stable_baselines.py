@@ -18,7 +18,6 @@ from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.policy_scores import make_vector_environment
 from hydrotele.envs.task_setup import TaskSetup
 
-
 _FOLLOWERS = {"log": ("tip",), "goal": ("log", "tip")}  # field -> fields that have to follow it
 
 
