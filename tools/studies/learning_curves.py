@@ -44,8 +44,8 @@ def make_row(task: str, result: dict) -> str:
     shown = f"{share['value']:.2f} ({share['low']:.2f} to {share['high']:.2f})" if share else "-"
     success = scores["policy"]["success"]
     options = ", ".join(f"{key} {value}" for key, value in result["options"].items())
-    cells = [task, options, f"{result['steps']:,}", f"{result['processor_seconds'] / 60.0:.1f}",
-             f"{result['seconds'] / 60.0:.1f}", cell("policy"), cell("zero"), cell("reference"), shown,
+    cells = [task, options, f"{result['steps']:,}", f"{result['processor_seconds']:.0f}",
+             f"{result['episodes']}", cell("policy"), cell("zero"), cell("reference"), shown,
              "-" if success is None else f"{success:.2f}"]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
@@ -57,8 +57,8 @@ def draw_curves(results: dict[str, dict], asked: argparse.Namespace) -> None:
         if "reference" not in result["scores"]:
             continue
         zero, reference = (result["scores"][name]["return"] for name in ("zero", "reference"))
-        rows = np.genfromtxt(asked.out / task / "learning_curve.csv", delimiter=",", names=True)
-        axes.plot(rows["steps"] / 1e3, (rows["return"] - zero) / (reference - zero), "o-", ms=3, label=task)
+        rows = np.genfromtxt(asked.out / task / "learning_curve.csv", delimiter=",", names=True)  # return -> return_
+        axes.plot(rows["steps"] / 1e3, (rows["return_"] - zero) / (reference - zero), "o-", ms=3, label=task)
     axes.axhline(0.5, color="0.6", ls="--")
     axes.set(xlabel="environment steps [1000]", ylabel="share of the reference's advantage [1]", ylim=(-0.2, 1.1))
     axes.legend()
@@ -77,8 +77,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     results = {}
-    print("| task | environment options | steps | processor time [min] | elapsed time [min] | policy return | zero "
-          "| reference | share (95 % interval) | success |\n| " + "--- | " * 10)  # fmt: skip
+    print("| task | environment options | steps | processor time [s] | episodes | policy return | zero | reference "
+          "| share (95 % interval) | success |\n| " + "--- | " * 10)  # fmt: skip
     for task in asked.tasks:
         results[task] = train_task(task, asked)
         print(make_row(task, results[task]), flush=True)
