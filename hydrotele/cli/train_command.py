@@ -85,7 +85,8 @@ def train_to_folder(options: TrainOptions) -> None:
     levels = {name: float(score.returns.mean()) for name, score in scores.items()}
     result: dict[str, Any] = {
         "task": plan.task, "options": plan.options, "steps": state.steps, "seconds": state.seconds,
-        "episodes": options.episodes, "scores": {name: score.summarise() for name, score in scores.items()},
+        "processor_seconds": state.processor_seconds, "episodes": options.episodes,
+        "scores": {name: score.summarise() for name, score in scores.items()},
         "folder": str(folder),
     }  # fmt: skip
     if "reference" in scores:

@@ -26,6 +26,7 @@ from hydrotele.envs.task import Task, sample_start_positions
 from hydrotele.envs.task_interface import (
     BEGIN,
     OBSERVE,
+    POTENTIAL,
     REWARD,
     TASK_SIGNATURE,
     TICK,
@@ -265,6 +266,32 @@ def compute_grade_reward(f, e, w):
     return (reward + SUCCESS_REWARD, True) if graded else (reward, False)
 
 
+@compiled
+def compute_grade_potential(f, e, w):
+    """Return the potential of the bucket's position: the success reward, discounted until the edge reaches the soil.
+
+    Args:
+        f: record of TASK_PARAMETERS.
+        e: record of EPISODE_STATE.
+        w: SimulationView.
+
+    Returns:
+        The potential, scalar: 5 gamma^n. In n steps, radius and height of the edge reach the point of the graded
+        ground that is highest above the plane, one after the other at the rates of full actions.
+
+    Source: this module.
+    """
+    surface, highest, best = soil_surface_view(w), FIRST_CELL, -np.inf
+    for i in range(FIRST_CELL, END_CELL):
+        over = surface[i] - target_plane_height(e.goal, PROFILE_START + (i + 0.5) * CELL_LENGTH)
+        if over > best:
+            highest, best = i, over
+    radius = PROFILE_START + (highest + 0.5) * CELL_LENGTH
+    time = abs(math.hypot(e.tip[0], e.tip[1]) - radius) / f.fastest_pose[0]
+    time += abs(e.tip[2] - surface[highest]) / f.fastest_pose[2]
+    return SUCCESS_REWARD * f.shaping ** (time / (f.ticks * f.period))
+
+
 GRADE_SOILS = ("soft", "sandy_loam", "firm")
 """Names of the soils, in the order of their indices."""
 
@@ -328,10 +355,10 @@ def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `Grade` for the simulation `number`, in native code.
 
     `part` is BEGIN (draw soil and target plane of a new episode), TICK (advance the soil by a
-    control period), OBSERVE (write the task's values to the observation, from the address `out` on)
-    or REWARD (return the reward and store whether the episode ends). `m`, `d` and `argument` are
-    the addresses of mjModel, mjData and TASK_PARAMETERS. The result is 0 except for REWARD; see
-    `task_interface.TASK_SIGNATURE`.
+    control period), OBSERVE (write the task's values to the observation, from the address `out`
+    on), REWARD (return the reward and store whether the episode ends) or POTENTIAL (return the
+    potential). `m`, `d` and `argument` are the addresses of mjModel, mjData and TASK_PARAMETERS. The
+    result is 0 for the other parts; see `task_interface.TASK_SIGNATURE`.
     """
     f = task_parameters_view(argument)[0]
     e, w = episode_states_view(f)[number], simulation_view(f, m, d, number, argument)
@@ -343,4 +370,6 @@ def run_task_part(part, m, d, number, argument, out):
         write_grade_observation(f, e, w, observation_view(f, out), 0)
     elif part == REWARD:
         return store_episode_end(e, compute_grade_reward(f, e, w))
+    elif part == POTENTIAL:
+        return compute_grade_potential(f, e, w)
     return 0.0

@@ -16,6 +16,9 @@ POLICY_FILE, STATE_FILE, CURVE_FILE = "policy.zip", "training.json", "learning_c
 RECIPES: dict[str, dict[str, Any]] = {
     "TrackTrajectory": {"action": "joint_rate", "control_rate": 25.0},
     "ReachFeller": {"action": "resolved_motion", "control_rate": 10.0},
+    "Grade": {"control_rate": 10.0},  # the discount factor of 0.98 then spans 5 s, a stroke of the bucket
+    "PlaceLog": {"control_rate": 10.0},
+    "LoadTruck": {"control_rate": 10.0},
 }
 """Task name -> options of the environment with which a policy is trained by default."""
 DEFAULT_RECIPE: dict[str, Any] = {"control_rate": 25.0}
@@ -73,6 +76,7 @@ class TrainingState:
         seconds: duration so far [s].
         curve: rows (steps, seconds, difficulty, mean return of training episodes, mean return and share
             of successful episodes of the evaluation; NaN where there is none).
+        processor_seconds: processor time so far [s], with the evaluations.
         reward_scale: variance, mean and count of the discounted returns, which scale the rewards.
     """
 
@@ -80,6 +84,7 @@ class TrainingState:
     steps: int = 0
     seconds: float = 0.0
     curve: list[list[float]] = dataclasses.field(default_factory=list)
+    processor_seconds: float = 0.0
     reward_scale: tuple[float, float, float] | None = None
 
     def save(self, folder: Path) -> None:

@@ -4,6 +4,7 @@ The policy acts alone: no controller takes part. Its file is a plain stable-base
 is the observation of the environment, since the network itself normalises it (`NormalisingExtractor`).
 """
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -35,6 +36,7 @@ _Algorithm: Any = PPO or object
 StageReport = Callable[[str, float], None]
 
 _FEATURE_LIMIT = 10.0  # largest normalised input of the network
+_FINEST_ERROR = 0.01  # errors smaller than this fraction of their RMS value are resolved linearly
 _LEARNING_RATE, _MIN_RATE_FRACTION = 1.0e-3, 0.05  # step size at the start, and its fraction at the end
 _EVALUATIONS = 20  # evaluations of the policy during training
 _CURVE_EPISODES, _CURVE_SEED = 16, 2 * 10**6  # episodes of such an evaluation, seed of the first one
@@ -50,8 +52,10 @@ class NormalisingExtractor(_Extractor):
     """First layer of a policy: append the reference errors to the observation and normalise both.
 
     A network hardly resolves millimetres in the difference of two positions that vary by metres, so
-    the errors (reference minus measured value) are additional inputs. Mean and variance are part of the
-    policy and are saved with it.
+    the errors e (reference minus measured value) are additional inputs. They appear twice: normalised like the
+    observation, and as asinh(e / s) / asinh(rms(e) / s) with s = 0.01 rms(e), which resolves errors that are
+    small compared with those at the start of an episode. Mean and variance are part of the policy and are
+    saved with it.
     """
 
     def __init__(self, observation_space: Box, reference: tuple[int, ...] = (), measured: tuple[int, ...] = ()):
@@ -63,7 +67,7 @@ class NormalisingExtractor(_Extractor):
             measured: columns (m,) of the measured values of the same quantities.
         """
         size = observation_space.shape[0] + len(reference)
-        super().__init__(observation_space, size)
+        super().__init__(observation_space, size + len(reference))
         self.register_buffer("reference", torch.tensor(reference, dtype=torch.long))
         self.register_buffer("measured", torch.tensor(measured, dtype=torch.long))
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
@@ -75,9 +79,13 @@ class NormalisingExtractor(_Extractor):
         return torch.cat([observations, errors], dim=-1)
 
     def forward(self, observations: Any) -> Any:
-        """Return the normalised features (n, o + m) of observations (n, o)."""
-        values = (self._append_errors(observations) - self.mean) / torch.sqrt(self.variance + 1e-8)
-        return values.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT).float()
+        """Return the features (n, o + 2 m) of observations (n, o)."""
+        values = self._append_errors(observations)
+        normalised = (values - self.mean) / torch.sqrt(self.variance + 1e-8)
+        errors = slice(observations.shape[-1], None)
+        scales = _FINEST_ERROR * torch.sqrt(self.variance[errors] + self.mean[errors] ** 2 + 1e-8)
+        compressed = torch.asinh(values[..., errors] / scales) / math.asinh(1.0 / _FINEST_ERROR)
+        return torch.cat([normalised.clamp(-_FEATURE_LIMIT, _FEATURE_LIMIT), compressed], dim=-1).float()
 
     def update_statistics(self, observations: np.ndarray) -> None:
         """Add observations (..., o) to the mean and the variance of the features."""
@@ -127,6 +135,7 @@ class _Supervisor(_Callback):
 
     def _on_training_start(self) -> None:
         self._begin, self._first_steps = time.monotonic() - self._state.seconds, self._state.steps
+        self._processor_begin = time.process_time() - self._state.processor_seconds
         self._next_evaluation = self._fraction()
 
     def _fraction(self) -> float:
@@ -168,6 +177,7 @@ class _Supervisor(_Callback):
         scores = evaluate_policies(self._evaluation, {"policy": PolicyController(self.model)}, _CURVE_SEED)["policy"]
         success = float(np.mean(scores.success)) if scores.success is not None else float("nan")
         state.steps, state.seconds = self._count_steps(), time.monotonic() - self._begin
+        state.processor_seconds = time.process_time() - self._processor_begin
         difficulty = self._env.venv.difficulty
         state.curve.append([
             state.steps, state.seconds, difficulty, self._training_return(), float(np.mean(scores.returns)), success,
@@ -263,5 +273,5 @@ def load_policy(path: Path) -> PolicyController:
         raise InputError(path, "needs stable-baselines3: pip install 'hydrotele[learn]'")
     try:
         return PolicyController(_ScheduledPPO.load(path, device="cpu"))
-    except (OSError, ValueError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise InputError(path, f"is not a policy of stable-baselines3: {error}") from None

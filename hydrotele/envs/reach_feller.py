@@ -15,7 +15,6 @@ from hydrotele.envs.task import (
     Task,
     compute_measured_pose,
     compute_path_effort,
-    count_recovery_steps,
     sample_start_positions,
     wrap_angle,
 )
@@ -207,21 +206,25 @@ def compute_reach_reward(f, e, w):
 
 @compiled
 def compute_reach_potential(f, e):
-    """Return the potential of the true pose: the success reward, discounted until all errors have vanished.
+    """Return the potential of the true pose: the success reward, discounted until the pose has been held.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
 
     Returns:
-        The potential, scalar: 10 gamma^n, where the sum of position, attitude and head error vanishes in n steps.
+        The potential, scalar: 10 gamma^n. In n steps, the errors of r, theta, z, attitude and head vanish
+        one after the other at the rates of full actions, and the rest of HOLD_TIME passes.
 
-    Source: `count_recovery_steps`.
+    Source: this module.
     """
-    arm, target = arm_values(f, e.position), e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
-    distance, _ = _compute_true_pose_errors(f, e)
-    angles = abs(wrap_angle(arm[1] + arm[2] + arm[3] - target[3])) + abs(arm[4] - target[4])
-    return SUCCESS_REWARD * f.shaping ** count_recovery_steps(f, combine_pose_errors(distance, angles))
+    pose = np.empty(MAX_ARM_AXES)
+    compute_tip_pose(f.arm, arm_values(f, e.position), pose)
+    time = HOLD_TIME - e.goal[_TIME_HELD]
+    for c in range(MAX_ARM_AXES):
+        error = pose[c] - e.goal[_TARGET + c]
+        time += abs(error if c in (0, 2) else wrap_angle(error)) / f.fastest_pose[c]
+    return SUCCESS_REWARD * f.shaping ** (time / (f.ticks * f.period))
 
 
 def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[str, float]:

@@ -18,27 +18,30 @@ from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.policy_scores import make_vector_environment
 from hydrotele.envs.task_setup import TaskSetup
 
+_FOLLOWERS = {"log": ("tip",), "goal": ("log", "tip")}  # field -> fields that have to follow it
+
 
 def find_reference_and_measured_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return the observation columns of references and of the present measured values of the same quantities.
 
-    References of a later time (`reference_in_..._ms`) are included. A reference without a measured
-    value in the observation is omitted.
+    References of a later time (`reference_in_..._ms`) are included. A log is a reference for the tip, and its
+    goal pose one for the log and the tip. A reference without a measured value in the observation is omitted.
 
     Args:
         setup: the task with its options.
 
     Returns:
-        (columns (m,) of fields `reference...`, columns (m,) of the corresponding measured values).
+        (columns (m,) of references, columns (m,) of the corresponding measured values).
     """
     places = {field.name: number for number, field in enumerate(setup.fields)}
     asked, measured = [], []
     for number, field in enumerate(setup.fields):
         what, _, where = field.name.partition(".")
         start, _, rest = what.partition("_")
-        if start != "reference":
-            continue
-        twins = (rest,) if rest in ("rate", "force") else ("angle", "position", "length", "tip")
+        if start == "reference":
+            twins = (rest,) if rest in ("rate", "force") else ("angle", "position", "length", "tip")
+        else:
+            twins = _FOLLOWERS.get(what, ())
         for twin in twins:
             name = f"{twin}.{where}" if where else twin
             if name in places:

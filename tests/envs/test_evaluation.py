@@ -88,6 +88,9 @@ def test_an_agent_sees_errors_and_the_past_and_corrects_a_law():
     sliding = core.setup._replace(fields=[f._replace(name=f"{what}.slide") for f, what in
                                   zip(core.setup.fields, ("position", "reference"), strict=False)])  # fmt: skip
     assert [columns.tolist() for columns in find_reference_and_measured_columns(sliding)] == [[1], [0]]
+    names = ("tip.r", "log.r", "goal.r")
+    timber = core.setup._replace(fields=[f._replace(name=n) for f, n in zip(core.setup.fields, names, strict=False)])
+    assert [columns.tolist() for columns in find_reference_and_measured_columns(timber)] == [[1, 2, 2], [0, 1, 0]]
     core.reset(np.arange(3))
     view.begin(3)
     alone.begin(3)

@@ -17,7 +17,7 @@ import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.catalogue import make_controller
 
-SECONDS = {"TrackTrajectory": 4.0, "StraightLine": 2.0, "ReachFeller": 1.5, "PlaceLog": 12.0}
+SECONDS = {"TrackTrajectory": 4.0, "StraightLine": 2.0, "ReachFeller": 1.5, "PlaceLog": 12.0, "LoadTruck": 12.8}
 SHOWN = 6.0  # s, of the others
 SEEDS = {"TrackTrajectory": 3, "ReachFeller": 2}
 SEED = 1  # of the others
@@ -25,7 +25,7 @@ SIZE = (560, 400)
 COLOURS = 256
 
 picture, tasks = Path(sys.argv[1]), sys.argv[2:] or hydrotele.envs.TASK_NAMES
-columns = 2 if len(tasks) in (2, 4) else min(3, len(tasks))
+columns = 2 if len(tasks) in (2, 4) else min(4 if len(tasks) > 6 else 3, len(tasks))
 rows = -(-len(tasks) // columns)
 whole = Image.new("RGB", (columns * SIZE[0], rows * SIZE[1]), (255, 255, 255))
 font = ImageFont.load_default(24)

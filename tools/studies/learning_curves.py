@@ -44,22 +44,23 @@ def make_row(task: str, result: dict) -> str:
     shown = f"{share['value']:.2f} ({share['low']:.2f} to {share['high']:.2f})" if share else "-"
     success = scores["policy"]["success"]
     options = ", ".join(f"{key} {value}" for key, value in result["options"].items())
-    cells = [task, options, f"{result['steps']:,}", f"{result['seconds'] / 60.0:.0f}", cell("policy"), cell("zero"),
-             cell("reference"), shown, "-" if success is None else f"{success:.2f}"]  # fmt: skip
+    cells = [task, options, f"{result['steps']:,}", f"{result['processor_seconds']:.0f}",
+             f"{result['episodes']}", cell("policy"), cell("zero"), cell("reference"), shown,
+             "-" if success is None else f"{success:.2f}"]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
 
 def draw_curves(results: dict[str, dict], asked: argparse.Namespace) -> None:
-    """Draw the share of the advantage against the training time for every task."""
+    """Draw the share of the advantage against the environment steps for every task."""
     figure, axes = plt.subplots(figsize=(7.0, 4.2), layout="constrained")
     for task, result in results.items():
         if "reference" not in result["scores"]:
             continue
         zero, reference = (result["scores"][name]["return"] for name in ("zero", "reference"))
-        rows = np.genfromtxt(asked.out / task / "learning_curve.csv", delimiter=",", names=True)
-        axes.plot(rows["seconds"] / 60.0, (rows["return"] - zero) / (reference - zero), "o-", ms=3, label=task)
+        rows = np.genfromtxt(asked.out / task / "learning_curve.csv", delimiter=",", names=True)  # return -> return_
+        axes.plot(rows["steps"] / 1e3, (rows["return_"] - zero) / (reference - zero), "o-", ms=3, label=task)
     axes.axhline(0.5, color="0.6", ls="--")
-    axes.set(xlabel="training time [min]", ylabel="share of the reference's advantage [1]", ylim=(-0.2, 1.1))
+    axes.set(xlabel="environment steps [1000]", ylabel="share of the reference's advantage [1]", ylim=(-0.2, 1.1))
     axes.legend()
     axes.grid(alpha=0.3)
     figure.savefig(asked.out / "learning_curves.png", dpi=100)
@@ -76,8 +77,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     results = {}
-    print("| task | environment options | steps | minutes | policy return | zero | reference | share (95 % interval) "
-          "| success |\n| " + "--- | " * 9)  # fmt: skip
+    print("| task | environment options | steps | processor time [s] | episodes | policy return | zero | reference "
+          "| share (95 % interval) | success |\n| " + "--- | " * 10)  # fmt: skip
     for task in asked.tasks:
         results[task] = train_task(task, asked)
         print(make_row(task, results[task]), flush=True)
