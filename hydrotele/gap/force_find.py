@@ -48,7 +48,6 @@ from hydrotele.gap.patched import (
     sensor_errors,
     write_mechanism,
 )
-from hydrotele.gap.residuals import believed_part
 from hydrotele.gap.result import (
     LIKELY,
     Alternative,
@@ -494,8 +493,8 @@ def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float
 def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
     """Effect -> its probability, and those of its alternatives.
 
-    The probability against rivals and none is scaled with that of the fraction of the variance of the missing force
-    that the effect explains, on the drive that it moves most.
+    If a force is still missing on the drive that the effect moves most, the probability against rivals and none is
+    multiplied with the fraction of the variance of the missing force that the effect explains there.
     """
     out = {}
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
@@ -512,7 +511,7 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         own = int(np.argmax(np.sqrt(np.mean(force**2, axis=0)) / evidence.shape.std))
         alike = evidence.judge_alike(rest.guess, found.judged)  # its uncertain parameters must not take the place
         now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, alike))
-        trust = believed_part(1.0 - now / without if without > now else 0.0)
+        trust = 1.0 - now / max(now, without) if now > 0.0 else 1.0
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
             for r, chance in zip(rivals, table[2:], strict=True) if chance >= _MIN_PROBABILITY
