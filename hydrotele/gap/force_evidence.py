@@ -24,14 +24,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Fit, Judged, fit_guess, invert_information, sandwich_variances
 from hydrotele.estimate.filter import MEMORY, Gains, Input
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
-from hydrotele.estimate.residual_force import whiten_forces
+from hydrotele.estimate.residual_force import innovations, whiten_forces
 from hydrotele.estimate.track import Levels
 from hydrotele.gap.dictionary import Version
 from hydrotele.gap.force_columns import ForceEffect
@@ -88,13 +87,10 @@ class NoiseShape(NamedTuple):
 
     def prewhiten(self, values: np.ndarray, doubt: np.ndarray, starts: Sequence[int]) -> np.ndarray:
         """Make forces (n, k, ...) white by the shape alone, run by run; the first q rows of each run are left out."""
-        order, parts = len(self.follow), []
-        flat = values.reshape(*values.shape[:2], -1) * self.weights(doubt)[:, :, None]
+        order, parts, weight = len(self.follow), [], self.weights(doubt)
+        flat = values.reshape(*values.shape[:2], -1) * weight[:, :, None]
         for first, last in zip(starts[:-1], starts[1:], strict=True):
-            own = np.empty((max(last - first - order, 0), *flat.shape[1:]))
-            for k in range(flat.shape[1]):
-                fresh = np.concatenate([[1.0], -self.follow[:, k]])
-                own[:, k] = lfilter(fresh, 1.0, flat[first:last, k], axis=0)[order:]
+            own = innovations(flat[first:last], weight[first:last] <= 0.0, self.follow)[order:]
             parts.append(np.einsum("ij,njm->nim", self.white, own))
         return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
@@ -179,17 +175,37 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     plain = NoiseShape(np.zeros((0, drives)), np.eye(drives), variances, np.ones(drives))
     weight, starts = plain.weights(columns.doubt), columns.starts
     order = max(1, int(_ORDER_SHARE * MEMORY / columns.spacing))
-    echo = np.diagonal(_fast_covariance(rest * weight, weight, starts, order, columns.spacing), axis1=1, axis2=2)
-    follow = np.column_stack([solve_toeplitz(c[:-1], c[1:]) if c[0] > 0.0 else np.zeros(order) for c in echo.T])
-    plain = plain._replace(follow=follow, std=np.maximum(np.sqrt(echo[0] / free), 1e-12))
-    new = plain.prewhiten(rest, columns.doubt, starts)
-    there = np.concatenate([weight[a + order : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])
-    fewer = [max(0, a - order * run) for run, a in enumerate(starts)]
-    between = _fast_covariance(new, there.astype(float), fewer, order, columns.spacing)[0] / free
+    total = _fast_covariance(rest * weight, weight, starts, order, columns.spacing)[0]
+    plain = plain._replace(std=np.maximum(np.sqrt(np.diag(total) / free), 1e-12))
+
+    def whiten(follow: np.ndarray) -> tuple[NoiseShape, np.ndarray, np.ndarray]:
+        shape = plain._replace(follow=follow)
+        new, memory = shape.prewhiten(rest, columns.doubt, starts), len(follow)
+        there = np.concatenate([weight[a + memory : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])
+        fewer = [max(0, a - memory * run) for run, a in enumerate(starts)]
+        return shape, new, _fast_covariance(new, there.astype(float), fewer, order, columns.spacing), there, fewer
+
+    passed = follow_low_pass(columns)
+    _, new, covariance, *_ = whiten(np.tile(passed[:, None], drives))
+    echo = np.diagonal(covariance, axis1=1, axis2=2)
+    own = [solve_toeplitz(c[:-1], c[1:]) if c[0] > 0.0 else np.zeros(order) for c in echo.T]
+    follow = np.column_stack([-np.convolve(np.append(1.0, -passed), np.append(1.0, -one))[1:] for one in own])
+    plain, new, covariance, there, fewer = whiten(follow)
+    between = covariance[0] / free
     ratio = np.sqrt(_usual_fraction(new, there, fewer, max(1, round(MEMORY / columns.spacing))))
     size, ways = np.linalg.eigh(between * np.outer(ratio, ratio))
     white = (ways / np.sqrt(np.maximum(size, 1e-12 * size.max()))) @ ways.T
     return plain._replace(white=white, std=ratio * plain.std)
+
+
+def follow_low_pass(columns: Columns) -> np.ndarray:
+    """Return the autoregression (q,) of white noise after the low-pass and decimation of the forces."""
+    taps, thin = design_low_pass(columns.band, columns.row)
+    echo = np.correlate(taps, taps, "full")[len(taps) - 1 :: thin]
+    order = max(1, int(MEMORY / columns.spacing))
+    spectrum = np.fft.hfft(echo, 8 * (order + len(echo)))
+    echo = np.fft.ihfft(np.maximum(spectrum, _LEAST_NOISE * spectrum.mean())).real
+    return solve_toeplitz(echo[:order], echo[1 : order + 1])
 
 
 def _usual_fraction(new: np.ndarray, there: np.ndarray, starts: Sequence[int], length: int) -> np.ndarray:

@@ -24,7 +24,7 @@ from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
-from hydrotele.gap.find import Progress, verdict_of, without_details
+from hydrotele.gap.find import Progress, verdict_of
 from hydrotele.gap.force_columns import ForceEffect, force_effects
 from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
@@ -204,14 +204,13 @@ def find_force_gap(
             is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
             evidence, found = _given_model(task)
             result = _evaluate(task, evidence, found.judged, then)
-        named = _describe_effects(task, evidence, result, chances)
-        named, more = without_details(named, bool(result.is_lacking.any()), task.drives)
-        unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
-        named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
-        details += more
-        if not more:
+        described = _describe_effects(task, evidence, result, chances)
+        named = tuple(e for e in described if e.mechanism_probability >= LIKELY)
+        unlikely = tuple(e for e in described if e not in named)
+        details += unlikely
+        if not unlikely:
             break
-        judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in more})
+        judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in unlikely})
         result = _evaluate(task, evidence, judged, then)
     result = _compare_heldout(result, mechanism.setup.chain, nominal)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
@@ -662,7 +661,7 @@ def _rejections(
     found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], untrue: Sequence[str]
 ) -> tuple[Rejection, ...]:
     """What was tried and not named, with the test that it failed."""
-    out = [Rejection(e.name, e.location, "fraction of the gap closed", e.share, MIN_FORCE_SHARE) for e in details]
+    out = [Rejection(e.name, e.location, "probability", e.mechanism_probability, LIKELY) for e in details]
     if not found.guess.parts:
         out += [
             Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)

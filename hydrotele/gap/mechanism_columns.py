@@ -287,7 +287,7 @@ def _run_columns(
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    of_drives, quick = _drive_columns(setup, fine, sizes, (table.nominal, value), record.period)
+    of_drives, quick = _drive_columns(setup, fine, motion.rate_std, sizes, (table.nominal, value), record.period)
     quick = _onto(quick, band, record.period, own.time)
     rubs, turns, calm = _dry_friction(setup, fine, band, record.period)
     turns, calm = (_onto(one, band, record.period, own.time) for one in (turns, calm))
@@ -318,7 +318,7 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, values, period: float):
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, rate_std: np.ndarray, sizes, values, period: float):
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m).
 
     A scale has the forces of the given parameters, the first of `values`: with friction that was found, it could take
@@ -326,11 +326,7 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, values, per
     """
     chain = setup.chain
     found = setup.project_motion_on_drives(*motion)
-    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
-    given, base = (
-        setup.compute_regressor(found).matrix @ np.array(values).T
-        + np.einsum("nkv,nv->nk", found.joint_projection, passive)[:, :, None]
-    ).transpose(2, 0, 1)
+    given, base = (predict_forces(setup, motion, numbers, rate_std) for numbers in values)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
     for k, drive in enumerate(chain.drives):
