@@ -64,7 +64,8 @@ def innovations(values: np.ndarray, missing: np.ndarray, follow: np.ndarray) -> 
     Returns:
         (n, k, m) innovations, 0 where missing. The values before the first row are taken for 0.
 
-    >>> innovations(np.array([4.0, 9.0, 2.0]).reshape(3, 1, 1), np.array([[0], [1], [0]], bool), np.array([[0.5]])).ravel()
+    >>> force, is_missing = np.array([4.0, 9.0, 2.0]), np.array([False, True, False])
+    >>> innovations(force.reshape(3, 1, 1), is_missing.reshape(3, 1), np.array([[0.5]])).ravel()
     array([4., 0., 1.])
     """
     if not len(follow):
