@@ -89,6 +89,10 @@ _DIFFERS = (
     "{} at {}, found on the fitted runs, differs between parts of these runs ({:.2g} to {:.2g} times the fitted value,"
     " twice the log Bayes factor against a constant value {:.0f}); it was rejected."
 )
+_MINOR = (
+    "{} at {} ({}) is in the patched model, because it explains a part of the force errors, but is not named: it is"
+    " small, or something else probably causes them."
+)
 _HELD_OUT_ONLY = "A force of {:.3g} {} RMS acts on {} in the held-out run {} alone; the fitted runs do not show it."
 METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
 
@@ -188,30 +192,21 @@ def find_force_gap(
     evidence, found = _search(task, effects, tell)
     tell("evaluate the patched model on the held-out run", 0.9)
     chances = _probabilities(evidence, found)
-    small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
-             for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
-    judged, untrue = _remove_effects(evidence, found.judged, small), list(small.values())
+    small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)}
+    judged, untrue = found.judged, list[str]()
     varying: dict[Key, str] = {}
     while varying := _varying(evidence, judged):
         untrue += varying.values()
         judged = _remove_effects(evidence, judged, varying)
-    details: tuple[NamedEffect, ...] = ()
-    is_rejected = False
-    then = build_columns([heldout], mechanism, task.band)
+    then, is_rejected = build_columns([heldout], mechanism, task.band), False
     result = _evaluate(task, evidence, judged, then)
-    while True:
-        if not _error_ratio(task, evidence, result) <= _WORSE:
-            is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
-            evidence, found = _given_model(task)
-            result = _evaluate(task, evidence, found.judged, then)
-        described = _describe_effects(task, evidence, result, chances)
-        named = tuple(e for e in described if e.mechanism_probability >= LIKELY)
-        unlikely = tuple(e for e in described if e not in named)
-        details += unlikely
-        if not unlikely:
-            break
-        judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in unlikely})
-        result = _evaluate(task, evidence, judged, then)
+    if not _error_ratio(task, evidence, result) <= _WORSE:
+        is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
+        evidence, found = _given_model(task)
+        result = _evaluate(task, evidence, found.judged, then)
+    described = _describe_effects(task, evidence, result, chances)
+    named = tuple(e for e in described if e.mechanism_probability >= LIKELY and (e.name, e.location) not in small)
+    minor = tuple(e for e in described if e not in named)
     result = _compare_heldout(result, mechanism.setup.chain, nominal)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
@@ -225,7 +220,7 @@ def find_force_gap(
     total = [float(np.sqrt(np.mean(one**2))) for one in rms]
     more = [
         f"Forces are compared below {task.band:.3g} Hz.",
-        *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
+        *(_MINOR.format(e.name, e.location, _numbers({k: v.value for k, v in e.parameters.items()})) for e in minor),
     ]
     of_fit, of_heldout = result.is_lacking
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
@@ -247,7 +242,7 @@ def find_force_gap(
         noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
         notes=(*notes, *untrue, *more), differences=result.differences, answers=tuple(answer_document(named)),
         explanation=VerdictExplanation(
-            compare_contenders(found, named), _rejections(found, named, details, untrue),
+            compare_contenders(found, named), _rejections(found, named, minor, untrue),
             _traces(task, evidence, result),
         ),
         seconds=time.perf_counter() - begin,
@@ -366,9 +361,8 @@ def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
     return float(np.linalg.norm(change)) < 1.0
 
 
-def _not_named(key: Key, values: Mapping[str, float]) -> str:
-    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-    return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
+def _numbers(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
 def _remove_effects(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
@@ -658,10 +652,10 @@ def _ranking(found: Found) -> tuple[Candidate, ...]:
 
 
 def _rejections(
-    found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], untrue: Sequence[str]
+    found: Found, named: Sequence[NamedEffect], minor: Sequence[NamedEffect], untrue: Sequence[str]
 ) -> tuple[Rejection, ...]:
     """What was tried and not named, with the test that it failed."""
-    out = [Rejection(e.name, e.location, "probability", e.mechanism_probability, LIKELY) for e in details]
+    out = [Rejection(e.name, e.location, "probability", e.mechanism_probability, LIKELY) for e in minor]
     if not found.guess.parts:
         out += [
             Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)
