@@ -468,10 +468,17 @@ def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]
 
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
-    """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
+    """RMS (k,) of the forces that are missing in a model [N] or [N m], 0 where they bring no evidence.
+
+    Errors that the readings do not allow as noise are a missing force that varies quickly.
+    """
+    largest = evidence.columns.max_noise / evidence.shape.std
     noise = judged.tracks[0].levels.noise
-    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt, noise)
-    return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
+    found = evidence.shape.missing_forces(
+        evidence.remaining_force(judged), evidence.columns.doubt, np.minimum(noise, largest)
+    )
+    is_there = (evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR) | (noise > largest)
+    return np.where(is_there, found, 0.0)
 
 
 def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float:

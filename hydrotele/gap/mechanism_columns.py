@@ -16,6 +16,7 @@ from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Parameter
+from hydrotele.estimate.levels import STATED_WIDTH
 from hydrotele.identify.equations import (
     RateErrors,
     apply_low_pass,
@@ -69,6 +70,7 @@ class Columns:
         runs: names.
         drives: names of the k drives.
         units: of their forces.
+        max_noise: (k,) largest plausible noise of the low-passed forces [N] or [N m].
     """
 
     names: tuple[str, ...]
@@ -86,6 +88,7 @@ class Columns:
     runs: tuple[str, ...]
     drives: tuple[str, ...]
     units: tuple[str, ...] = ()
+    max_noise: np.ndarray | float = np.inf
 
     @property
     def gap(self) -> np.ndarray:
@@ -224,8 +227,24 @@ def build_columns(
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
         states, sizes, band, parts[0][7], row, tuple(r.name for r in records), tuple(setup.chain.drives),
-        tuple(force_unit(setup.chain, drive) for drive in setup.chain.drives),
+        tuple(force_unit(setup.chain, drive) for drive in setup.chain.drives), _max_noise(records, band),
     )  # fmt: skip
+
+
+def _max_noise(records: Sequence[IdentificationRecord], band: float) -> np.ndarray:
+    """Return the noise (k,) of the low-passed forces that the readings allow with 95 %, coloured noise included.
+
+    The noise of a reading is the stated one, or that of third differences of the readings.
+    """
+    low, _ = design_low_pass(band, records[0].period)
+    squares = []
+    for record in records:
+        steps = np.abs(np.diff(record.force, n=3, axis=0))
+        rough = 1.4826 * np.nanmedian(steps, axis=0) / np.sqrt(20.0)  # of normal noise; robust against jumps
+        is_stated = np.isfinite(record.force_noise)
+        width = np.where(is_stated, STATED_WIDTH, 2.0 * STATED_WIDTH)
+        squares.append((np.where(is_stated, record.force_noise, rough) * np.exp(2.0 * width)) ** 2)
+    return np.sqrt(np.sum(low**2) * np.mean(squares, axis=0))
 
 
 def force_unit(chain: Chain, joint: str) -> str:
