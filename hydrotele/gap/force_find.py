@@ -25,19 +25,18 @@ from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
 from hydrotele.gap.find import Progress, verdict_of
-from hydrotele.gap.force_columns import ForceEffect, force_effects
+from hydrotele.gap.force_columns import SENTENCES, ForceEffect, force_effects
 from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
-    SENTENCES,
     TYPICAL,
     Columns,
     Key,
     build_columns,
     common_band,
     force_unit,
+    nominal_parameters,
     undone,
 )
-from hydrotele.gap.mechanism_find import MechanismModel, nominal_parameters
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
 from hydrotele.gap.patched import (
     COLUMNS_FILE,
@@ -95,6 +94,23 @@ _MINOR = (
 )
 _HELD_OUT_ONLY = "A force of {:.3g} {} RMS acts on {} in the held-out run {} alone; the fitted runs do not show it."
 METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
+
+
+@dataclass(frozen=True)
+class MechanismModel:
+    """A mechanism as a model that a gap is found against.
+
+    Attributes:
+        name: of the MJCF.
+        mjcf: the XML.
+        mapping: its columns.
+        tool: empty; machines have one.
+    """
+
+    name: str
+    mjcf: str
+    mapping: ColumnMapping
+    tool: str = ""
 
 
 class _Task(NamedTuple):
