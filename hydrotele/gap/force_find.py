@@ -296,7 +296,7 @@ def uncertain_form(mechanism: Mechanism, columns: Columns, about: Mapping[str, f
         columns: of the runs.
         about: parameter -> how much it differs from the given one, as far as is known.
     """
-    form = {"delay.force": 0.5 * columns.row}
+    form = {"delay.force": columns.row / math.sqrt(12.0)}  # uniform over a row
     for one in mechanism.setup.friction_terms:
         found = about.get(f"coulomb.{one.location}", 0.0)
         dry = abs(one.nominal.get("coulomb", 0.0) + found) + abs(one.nominal.get("stribeck", 0.0))
