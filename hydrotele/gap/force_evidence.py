@@ -38,7 +38,14 @@ from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm
 from hydrotele.gap.mechanism_columns import LEAST, TYPICAL, Columns, strengths
 from hydrotele.gap.model_search import PARAMETER_SCALES
-from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
+from hydrotele.gap.regression import (
+    OWN_SCALE,
+    RESIDUAL_SCALES,
+    LevelScale,
+    NormalEquations,
+    compare_groups,
+    hat_weights,
+)
 from hydrotele.identify.equations import design_low_pass
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
@@ -312,6 +319,8 @@ class ForceEvidence(GapModel):
         self.columns, self.shape, order = columns, shape, len(shape.follow)
         self.run_names = ()
         self.keep: Callable[[Judged], None] = lambda judged: None
+        alike = [LevelScale(size, size) for size in RESIDUAL_SCALES]
+        self.level_scales = (*alike, *(LevelScale(1.0, size) for size in (*RESIDUAL_SCALES[1:], 0.0)))
         self.max_effects = max(_MIN_EFFECTS, _EFFECTS_PER_DRIVE * columns.gap.shape[1])
         wide = typical_sizes(columns)
         self._unit = np.where(wide > 0.0, wide, 1.0)
@@ -401,7 +410,7 @@ class ForceEvidence(GapModel):
             inner = self._inner(square[count:, count:], levels)
             size, ways = np.linalg.eigh(square[:count, :count] - cross.T @ np.linalg.solve(inner, cross))
             wide = 2.0 * float(np.log(spread).sum()) + float(np.linalg.slogdet(inner)[1])
-            if len(self._roots) >= 2 * self.max_effects:
+            if len(self._roots) >= len(self.level_scales) * self.max_effects:
                 self._roots.pop(next(iter(self._roots)))
             self._roots[key] = np.sqrt(np.maximum(size, 0.0))[:, None] * ways.T, wide
         return self._roots[key]
@@ -528,9 +537,9 @@ class ForceEvidence(GapModel):
         fit = self.fit(judged.guess)
         return judged, replace(fit, guess=judged.guess)
 
-    def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
+    def refine(self, now: Judged, guess: Guess, scale: LevelScale, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension with scaled residual forces, and re-estimate the levels."""
-        self._levels = _shrink_levels(levels_of(now), residual_scale)
+        self._levels = _shrink_levels(levels_of(now), scale)
         self._root, _ = self._root_of(self._levels)
         fit = self.fit(guess)
         judged = self.judge(fit.guess)
@@ -552,8 +561,8 @@ class ForceEvidence(GapModel):
         )  # fmt: skip
 
     def compare_disturbances(
-        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
-    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        self, judged: Judged, candidates: Sequence[Hypothesis]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, LevelScale]]:
         """Return the most likely force pulse on a drive with a residual force, in one run; its column is added.
 
         A pulse is the difference of two steps, so the Gram matrix of steps at all instants gives the Bayes factor of
@@ -563,7 +572,7 @@ class ForceEvidence(GapModel):
         lacking = np.flatnonzero(self.residual_gain(judged) > _LEAST_PULSE) if self._has_pulses else ()
         columns, rest = self.columns, self._values @ self._sum_columns(judged.guess)
         losses, found = [], []
-        for scale in scales if len(lacking) else ():
+        for scale in self.level_scales[: len(RESIDUAL_SCALES)] if len(lacking) else ():
             levels = _shrink_levels(self._levels, scale)
             levels, value, cost = self._marginalise(rest, levels, [levels.parameter_scale])
             left = rest - self._nuisance @ value
@@ -578,7 +587,7 @@ class ForceEvidence(GapModel):
                     factor, size, start, end = self._best_interval(run, k, near, levels, left)
                     gain = losses[0] - losses[-1] + factor - _CHOICE_OF_INTERVAL
                     found.append((gain, scale, run, k, start, end, size))
-        gain, scale, run, k, start, end, size = max(found, default=(0.0,) * 7)
+        gain, scale, run, k, start, end, size = max(found, default=(0.0, LevelScale(), *(0.0,) * 5))
         if not gain > 0.0:
             return []
         return [((self._pulse(judged.guess, int(run), int(k), start, end), np.array([size])), gain, scale)]
@@ -668,9 +677,22 @@ class ForceEvidence(GapModel):
         return along, covariance * np.outer(wide, wide)
 
     def covariance(self, judged: Judged) -> np.ndarray:
-        """Return the covariance (P, P) of the deviations of the effects."""
-        count = len(judged.guess.deviation)
-        return self._posterior(judged)[1][:count, :count]
+        """Return the covariance (P, P) of the deviations of the effects about those of a model.
+
+        It is averaged over the scale of the uncertain parameters: the most likely scale alone would make it too small.
+        """
+        count, losses, found = len(judged.guess.deviation), [], []
+        for scale in self._choices if np.any(~self._is_form) else (levels_of(judged).parameter_scale,):
+            self.set_base(judged)
+            one = self._judge(judged.guess, (scale,))
+            self.set_base(one)
+            fit = self.fit(judged.guess)
+            losses.append(self._judge(fit.guess, (scale,)).loss + fit.whole_penalty)
+            off = fit.guess.deviation - judged.guess.deviation
+            found.append(self._posterior(one)[1][:count, :count] + np.outer(off, off))
+        self.set_base(judged)
+        weights = np.exp(-0.5 * (np.array(losses) - min(losses)))
+        return np.einsum("s,sij->ij", weights / weights.sum(), np.array(found))
 
     def uncertainty(self, judged: Judged) -> np.ndarray:
         """Return a root (m, r) of the covariance along the columns of all that was estimated."""
@@ -769,9 +791,9 @@ class ForceLinearisation:
         """Return the same."""
         return self
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
+    def equations(self, scale: LevelScale, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return the normal equations from the sums of squares at scaled residual forces."""
-        root, wide = self.evidence._root_of(_shrink_levels(self.evidence._levels, residual_scale))
+        root, wide = self.evidence._root_of(_shrink_levels(self.evidence._levels, scale))
         groups = [root @ g for g in self.groups]
         if joined:
             groups = [np.hstack([groups[g] for g in joined])]
@@ -779,9 +801,10 @@ class ForceLinearisation:
         return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
 
 
-def _shrink_levels(levels: ForceLevels, ratio: float) -> ForceLevels:
+def _shrink_levels(levels: ForceLevels, scale: LevelScale) -> ForceLevels:
     """Scale what stands in for missing effects: residual forces and uncertain parameters."""
-    return replace(levels, sizes=ratio * levels.sizes, parameter_scale=ratio * levels.parameter_scale)
+    sizes, parameters = scale.residual * levels.sizes, scale.parameters * levels.parameter_scale
+    return replace(levels, sizes=sizes, parameter_scale=parameters)
 
 
 def _level_prior(x: np.ndarray) -> float:
