@@ -195,7 +195,7 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     passed = follow_low_pass(columns)
     _, new, covariance, *_ = whiten(np.tile(passed[:, None], drives))
     echo = np.diagonal(covariance, axis1=1, axis2=2)
-    own = [solve_toeplitz(c[:-1], c[1:]) if c[0] > 0.0 else np.zeros(order) for c in echo.T]
+    own = [_autoregression(c, order) for c in echo.T]
     follow = np.column_stack([-np.convolve(np.append(1.0, -passed), np.append(1.0, -one))[1:] for one in own])
     plain, new, covariance, there, fewer = whiten(follow)
     between = covariance[0] / free
@@ -209,8 +209,17 @@ def follow_low_pass(columns: Columns) -> np.ndarray:
     """Return the autoregression (q,) of white noise after the low-pass and decimation of the forces."""
     taps, thin = design_low_pass(columns.band, columns.row)
     echo = np.correlate(taps, taps, "full")[len(taps) - 1 :: thin]
-    order = max(1, int(MEMORY / columns.spacing))
-    spectrum = np.fft.hfft(echo, 8 * (order + len(echo)))
+    return _autoregression(echo, max(1, int(MEMORY / columns.spacing)))
+
+
+def _autoregression(covariance: np.ndarray, order: int) -> np.ndarray:
+    """Autoregression (order,) of a process with an autocovariance at lags 0, 1, ..., and none at larger lags.
+
+    The spectrum of an estimated covariance may be negative somewhere; it is at least a fraction of its mean.
+    """
+    if not covariance[0] > 0.0:
+        return np.zeros(order)
+    spectrum = np.fft.hfft(covariance, 8 * (order + len(covariance)))
     echo = np.fft.ihfft(np.maximum(spectrum, _LEAST_NOISE * spectrum.mean())).real
     return solve_toeplitz(echo[:order], echo[1 : order + 1])
 
