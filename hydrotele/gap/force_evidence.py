@@ -597,9 +597,22 @@ class ForceEvidence(GapModel):
                     gain = losses[0] - losses[-1] + factor - _CHOICE_OF_INTERVAL
                     found.append((gain, scale, run, k, start, end, size))
         gain, scale, run, k, start, end, size = max(found, default=(0.0, LevelScale(), *(0.0,) * 5))
-        if not gain > 0.0:
+        if not gain > 0.0 or self._depends_on_motion(judged, int(k), max(f[0] for f in found if f[1].residual == 1.0)):
             return []
         return [((self._pulse(judged.guess, int(run), int(k), start, end), np.array([size])), gain, scale)]
+
+    def _depends_on_motion(self, judged: Judged, drive: int, gain: float) -> bool:
+        """Return whether a law over a position or rate explains the errors of a drive better than a pulse.
+
+        Args:
+            judged: the base.
+            drive: index of the drive.
+            gain: twice the log Bayes factor of the pulse.
+        """
+        force = np.zeros(self.columns.gap.shape)
+        force[:, drive] = self._pulse_size(drive)
+        factors, _ = self.compare_laws(judged, force, [[values] for values in self.columns.states.values()])
+        return float(factors.max()) > gain
 
     def _best_interval(
         self, run: int, drive: int, times: np.ndarray, levels: ForceLevels, left: np.ndarray
