@@ -191,7 +191,7 @@ def write_gap_files(
 
 def gap_mjcf_to_folder(
     data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
-    target: Path | None, as_json: bool, effects: Sequence[str] = (), method: Method = "search",
+    target: Path | None, as_json: bool, effects: Sequence[str] = (),
 ) -> Path:  # fmt: skip
     """Find the effects that explain the differences (gap) between an MJCF mechanism and its logs.
 
@@ -205,7 +205,6 @@ def gap_mjcf_to_folder(
         target: output folder, default `gap_<data>`.
         as_json: print `gap.json` instead of text.
         effects: names of the effects to test; if empty, all effects.
-        method: how effects are searched, `search` or `regression`.
 
     Returns:
         The output folder.
@@ -214,7 +213,6 @@ def gap_mjcf_to_folder(
         InputError: data, mechanism, mapping, effects or target are not usable.
     """
     from hydrotele.gap.force_find import find_force_gap
-    from hydrotele.gap.mechanism_find import find_mechanism_gap
     from hydrotele.gap.patched import COLUMNS_FILE, write_mechanism
     from hydrotele.show.gap_report import write_report
 
@@ -223,8 +221,7 @@ def gap_mjcf_to_folder(
     mechanism = load_mechanism(mjcf, columns)
     fit, judge, said = load_mechanism_records(data, mechanism, heldout, keep_measured_joints=True)
     with show_stages(f"gap {mechanism.setup.chain.name}", as_json) as progress:
-        find = find_force_gap if method == "regression" else find_mechanism_gap
-        gap = find(mjcf, columns, fit, judge, progress, effects, said)
+        gap = find_force_gap(mjcf, columns, fit, judge, progress, effects, said)
         if progress:
             progress("simulate the models with the measured forces", 0.95)
         try:

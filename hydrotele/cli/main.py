@@ -393,7 +393,7 @@ def gap(
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     method: Annotated[
         Literal["search", "regression"],
-        typer.Option(help="How effects are searched; regression is experimental."),
+        typer.Option(help="How effects of a hydraulic machine are searched; regression is experimental."),
     ] = "search",
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -412,7 +412,7 @@ def gap(
         if strange := [option for option, value in of_machines.items() if value]:
             raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
-        gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [], method)
+        gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [])
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,

@@ -308,7 +308,7 @@ say that it moved all the same: see `_white_states`.
 _MOST = 1.0e4  # times its floor that white noise can reach
 _RIPPLE = 10.0  # times its floor from which white noise counts as there
 LEAST = 1.0e-4  # of an input's largest size: below it an input is none
-_STATED = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
+STATED_WIDTH = 0.5  # prior standard deviation of log(noise / stated): a data sheet is good to a factor
 _LACK = 4.0  # prior standard deviation of log(size / least): says next to nothing
 _NOISIER = 1.25  # times the rough noise that a channel's noise can be: what is slow is no noise
 _QUIETER = 0.7  # times the stated or the rough noise, whichever is smaller: readings that scatter
@@ -424,7 +424,7 @@ def noise_prior(data: Dataset) -> Prior:
     """Prior of the readings' noise: what the machine states, and what the readings allow."""
     rough, stated = rough_noise(data), np.isfinite(data.noise)
     noise = np.where(stated, data.noise, rough)
-    width = np.where(stated, _STATED, 2.0 * _STATED)
+    width = np.where(stated, STATED_WIDTH, 2.0 * STATED_WIDTH)
     quieter = np.where(stated, _QUIETER, _QUIETER_UNSTATED)
     low = np.maximum(quieter * np.minimum(noise, rough), reading_resolution(data))  # an encoder's error at rest
     return Prior(noise, width, low, np.maximum(_NOISIER * rough, low))

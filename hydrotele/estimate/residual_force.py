@@ -35,6 +35,46 @@ def _whiten(values, missing, first, fade, noise, sizes, whitened, spread):
             variance = fade**2 * variance + (1.0 - fade**2) * sizes[k] ** 2
 
 
+@compiled
+def _innovate(values, missing, follow, out):
+    rows, channels, count = values.shape
+    order = len(follow)
+    past = np.zeros((order, count))
+    for k in range(channels):
+        past[:] = 0.0
+        for row in range(rows):
+            here = row % order  # the row of `past` that is `order` rows old
+            for m in range(count):
+                expected = 0.0
+                for lag in range(order):
+                    expected += follow[lag, k] * past[(row - 1 - lag) % order, m]
+                value = expected if missing[row, k] else values[row, k, m]
+                out[row, k, m] = value - expected
+                past[here, m] = value
+
+
+def innovations(values: np.ndarray, missing: np.ndarray, follow: np.ndarray) -> np.ndarray:
+    """Subtract what the previous rows of an autoregressive process predict; a missing row is as predicted.
+
+    Args:
+        values: (n, k, m) m series of k channels, filtered alike.
+        missing: (n, k) rows that are left out.
+        follow: (q, k) weights of the previous rows, the latest first.
+
+    Returns:
+        (n, k, m) innovations, 0 where missing. The values before the first row are taken for 0.
+
+    >>> force, is_missing = np.array([4.0, 9.0, 2.0]), np.array([False, True, False])
+    >>> innovations(force.reshape(3, 1, 1), is_missing.reshape(3, 1), np.array([[0.5]])).ravel()
+    array([4., 0., 1.])
+    """
+    if not len(follow):
+        return np.where(missing[:, :, None], 0.0, values)
+    out = np.empty(values.shape)
+    _innovate(np.ascontiguousarray(values), np.ascontiguousarray(missing), np.ascontiguousarray(follow), out)
+    return out
+
+
 def whiten_forces(
     values: np.ndarray, missing: np.ndarray, first: np.ndarray, fade: float, noise: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -10,21 +10,38 @@ import numpy as np
 
 from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.hypothesis import Hypothesis
-from hydrotele.gap.mechanism_columns import (
-    _ASIDE,
-    _MOST,
-    _NONE,
-    _NOTABLE,
-    _SECOND,
-    LEAST,
-    TYPICAL,
-    Columns,
-    Key,
-    _Builder,
-    _point,
-)
+from hydrotele.gap.mechanism_columns import LEAST, STRIBECK, TYPICAL, Columns, Key, strengths
 from hydrotele.multibody.chain import Chain
+from hydrotele.multibody.regressor import BODY_PARAMETERS
 
+SENTENCES = {
+    "coulomb_friction": "different Coulomb friction of a joint",
+    "viscous_friction": "different viscous friction of a joint",
+    "stribeck_friction": "additional friction of a drive near zero velocity",
+    "friction_asymmetry": "viscous friction that depends on the direction of a drive",
+    "speed_dependent_force": "resistance proportional to the square of the speed",
+    "joint_spring": "a spring in the joint of a drive",
+    "drive_inertia": "different inertia of a drive",
+    "payload": "an additional mass on a body (negative: the mass of the model is too large)",
+    "com_offset": "an offset of a body's centre of mass",
+    "inertia_error": "different moments of inertia of a body about its centre of mass",
+    "base_tilt": "a tilt of the base",
+    "force_pulse": "a constant force on a drive for a limited time in one run",
+    "force_offset": "a constant in a drive's force: an offset of its sensor, or a constant load",
+    "force_scale": "a scale error of a force sensor",
+    "force_delay": "a delay of a force sensor",
+    "angle_offset": "an offset of an angle sensor",
+    "length_offset": "an offset of a position sensor",
+    "angle_delay": "a delay of an angle sensor",
+    "length_delay": "a delay of a position sensor",
+    "clock_offset": "a delay of all forces relative to the positions (negative: of the positions)",
+}
+_MOST = 20.0  # times the typical size, where a search ends
+_FORM = 0.2  # of a drive's dry friction, which its form near rest may change
+_NONE = 1e-9  # share that has no effect
+_ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
+_NOTABLE = 0.2  # of a body's moments of inertia that is worth naming, little as forces may change
+_SECOND = 0.1  # s, beyond which no sensor is late
 _LATE_STEP = 0.02  # s, typical delay of a sensor, and its largest change from round to round
 
 
@@ -60,12 +77,30 @@ def force_effects(
     Returns:
         The effects. Those that move no drive's force are left out.
     """
-    build = _ForceBuilder(chain, columns, nominal, applied)
+    build = _Builder(chain, columns, nominal, applied)
     out = [*build.joints(), *build.bodies(), *build.sensors()]
     return [one for one in out if isinstance(one, ForceEffect)]
 
 
-class _ForceBuilder(_Builder):
+class _Builder:
+    def __init__(self, chain: Chain, columns: Columns, nominal, applied) -> None:
+        self.chain, self.columns, self.nominal, self.applied = chain, columns, nominal, applied
+        self.strength = dict(zip(columns.names, strengths(columns), strict=True))
+
+    def number(
+        self, column: str, unit: str, nominal: float = 0.0, low: float = -np.inf,
+        factor: float = 1.0,
+    ) -> Parameter | None:  # fmt: skip
+        """A parameter of which a unit adds `factor` along a column; None without effect."""
+        share = self.strength.get(column, 0.0) * abs(factor)
+        if share < _NONE:
+            return None
+        scale = TYPICAL / share
+        return Parameter(
+            unit, nominal, max(low, nominal - _MOST * scale), nominal + _MOST * scale, scale,
+            LEAST / share,
+        )  # fmt: skip
+
     def linear(
         self, name: str, place: str, parameter: str, column: str, unit: str, nominal: float = 0.0,
         low: float = -np.inf, variant: int = 0,
@@ -76,6 +111,46 @@ class _ForceBuilder(_Builder):
         return ForceEffect(
             name, place, {parameter: facts}, None, (column,), lambda p: p - nominal, variant,
         )  # fmt: skip
+
+    def units(self, joint: str) -> tuple[str, str, str, str]:
+        """Of force, position, rate and inertia of a joint or a closure."""
+        straight = joint in self.chain.joints and self.chain.tree.is_slide[self.chain.index(joint)]
+        return ("N", "m", "m/s", "kg") if straight else ("N m", "rad", "rad/s", "kg m^2")
+
+    def joints(self):
+        """Friction, springs and inertia."""
+        for place in (*self.chain.joints, *self.chain.closures):
+            force, length, _, inertia = self.units(place)
+            for name, kind, unit, low in (
+                ("coulomb_friction", "coulomb", force, 0.0),
+                ("viscous_friction", "viscous", f"{force} s/{length}", 0.0),
+                ("friction_asymmetry", "viscous_asymmetry", f"{force} s/{length}", -np.inf),
+                ("speed_dependent_force", "quadratic", f"{force} s^2/{length}^2", 0.0),
+                ("drive_inertia", "drive_inertia", inertia, 0.0),
+            ):
+                if kind == "drive_inertia" and place not in self.chain.drives:
+                    continue
+                column = f"{kind}.{place}"
+                given = self.nominal.get(column, 0.0)
+                yield self.linear(name, place, kind, column, unit, given, min(low, given))
+            if place not in self.chain.drives:
+                continue
+            for variant in range(len(STRIBECK)):
+                one = self.linear(
+                    "stribeck_friction", place, "stribeck", f"stribeck{variant}.{place}", force,
+                    0.0, 0.0, variant,
+                )  # fmt: skip
+                yield one and self.sliding(one)
+            yield self.spring(place)
+
+    def sliding(self, one: ForceEffect) -> ForceEffect:
+        """Stribeck's effect, not worth naming below a part of dry friction.
+
+        The form of that near rest (sticking, presliding) is never known as well as far from it.
+        """
+        (facts,) = one.parameters.values()
+        least = max(facts.min_relevant_change, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
+        return replace(one, parameters={"stribeck": replace(facts, min_relevant_change=least)})
 
     def spring(self, drive: str) -> ForceEffect | None:
         force, length, _, _ = self.units(drive)
@@ -98,6 +173,25 @@ class _ForceBuilder(_Builder):
             "joint_spring", drive, {"stiffness": facts, "rest": slack}, None,
             (f"spring.{drive}", f"offset.{drive}"), coefficients,
         )  # fmt: skip
+
+    def bodies(self):
+        """Payload, centre of mass and inertia."""
+        for k, body in enumerate(self.chain.bodies):
+            names = tuple(f"{kind}.{body}" for kind in BODY_PARAMETERS)
+            if any(name not in self.strength for name in names):
+                continue
+            given = self.chain.inertia[k]
+            mass = float(given[0])
+            about = _matrix(given[4:])
+            centre = given[1:4] / mass if mass > 0.0 else np.zeros(3)
+            size = float(np.sqrt(max(np.trace(about), 0.0) / (2.0 * mass))) if mass > 0.0 else 0.0
+            size = max(size, 0.02)  # m
+            yield self.payload(body, names, mass, centre, size)
+            if mass <= 0.0:
+                continue
+            yield self.move_mass(body, names[1:], mass, centre, size)
+            own = about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+            yield self.turn_inertia(body, names[4:], own)
 
     def payload(self, body, names, mass, centre, size) -> ForceEffect | None:
         move = max(self.strength[n] for n in names[1:4])
@@ -141,6 +235,21 @@ class _ForceBuilder(_Builder):
         ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
         return ForceEffect("inertia_error", body, {"ratio": ratio}, None, names, lambda p: (p[0] - 1.0) * upper)
 
+    def sensors(self):
+        """Defects of sensors, and the base."""
+        for drive in self.chain.drives:
+            force = self.units(drive)[0]
+            yield self.linear("force_offset", drive, "offset", f"offset.{drive}", force)
+            yield self.scale(drive)
+            yield self.delay("force_delay", drive, f"delay.force.{drive}", 0.0)
+        yield self.delay("clock_offset", "force", "delay.force", -_SECOND)
+        for joint in self.columns.sizes:
+            unit, kind = self.units(joint)[1], "length" if self.units(joint)[1] == "m" else "angle"
+            column = f"offset.position.{joint}"
+            yield self.linear(f"{kind}_offset", joint, "offset", column, unit)
+            yield self.delay(f"{kind}_delay", joint, f"delay.position.{joint}", 0.0)
+        yield self.tilt()
+
     def delay(self, name: str, place: str, column: str, low: float) -> ForceEffect | None:
         facts = self.number(column, "s")
         if facts is None:
@@ -173,3 +282,14 @@ class _ForceBuilder(_Builder):
             return None
         way = Parameter("rad", 0.0, -0.3, 0.3, 0.03, LEAST / share)
         return ForceEffect("base_tilt", "base", {"x": way, "y": way}, None, ("tilt.x", "tilt.y"))
+
+
+def _point(place: np.ndarray) -> np.ndarray:
+    """Inertia (6,) of a unit mass at a place, about the origin."""
+    x, y, z = place
+    return np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
+
+
+def _matrix(upper: np.ndarray) -> np.ndarray:
+    xx, xy, xz, yy, yz, zz = upper
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -24,14 +24,13 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from hydrotele.effects.effect import Parameter
 from hydrotele.estimate.evidence import Fit, Judged, fit_guess, invert_information, sandwich_variances
 from hydrotele.estimate.filter import MEMORY, Gains, Input
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
-from hydrotele.estimate.residual_force import whiten_forces
+from hydrotele.estimate.residual_force import innovations, whiten_forces
 from hydrotele.estimate.track import Levels
 from hydrotele.gap.dictionary import Version
 from hydrotele.gap.force_columns import ForceEffect
@@ -39,7 +38,14 @@ from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm
 from hydrotele.gap.mechanism_columns import LEAST, TYPICAL, Columns, strengths
 from hydrotele.gap.model_search import PARAMETER_SCALES
-from hydrotele.gap.regression import OWN_SCALE, NormalEquations, compare_groups, hat_weights
+from hydrotele.gap.regression import (
+    OWN_SCALE,
+    RESIDUAL_SCALES,
+    LevelScale,
+    NormalEquations,
+    compare_groups,
+    hat_weights,
+)
 from hydrotele.identify.equations import design_low_pass
 from hydrotele.identify.estimation import compute_weights, estimate_error_variances
 
@@ -88,13 +94,10 @@ class NoiseShape(NamedTuple):
 
     def prewhiten(self, values: np.ndarray, doubt: np.ndarray, starts: Sequence[int]) -> np.ndarray:
         """Make forces (n, k, ...) white by the shape alone, run by run; the first q rows of each run are left out."""
-        order, parts = len(self.follow), []
-        flat = values.reshape(*values.shape[:2], -1) * self.weights(doubt)[:, :, None]
+        order, parts, weight = len(self.follow), [], self.weights(doubt)
+        flat = values.reshape(*values.shape[:2], -1) * weight[:, :, None]
         for first, last in zip(starts[:-1], starts[1:], strict=True):
-            own = np.empty((max(last - first - order, 0), *flat.shape[1:]))
-            for k in range(flat.shape[1]):
-                fresh = np.concatenate([[1.0], -self.follow[:, k]])
-                own[:, k] = lfilter(fresh, 1.0, flat[first:last, k], axis=0)[order:]
+            own = innovations(flat[first:last], weight[first:last] <= 0.0, self.follow)[order:]
             parts.append(np.einsum("ij,njm->nim", self.white, own))
         return np.concatenate(parts).reshape(-1, *values.shape[1:])
 
@@ -179,17 +182,46 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     plain = NoiseShape(np.zeros((0, drives)), np.eye(drives), variances, np.ones(drives))
     weight, starts = plain.weights(columns.doubt), columns.starts
     order = max(1, int(_ORDER_SHARE * MEMORY / columns.spacing))
-    echo = np.diagonal(_fast_covariance(rest * weight, weight, starts, order, columns.spacing), axis1=1, axis2=2)
-    follow = np.column_stack([solve_toeplitz(c[:-1], c[1:]) if c[0] > 0.0 else np.zeros(order) for c in echo.T])
-    plain = plain._replace(follow=follow, std=np.maximum(np.sqrt(echo[0] / free), 1e-12))
-    new = plain.prewhiten(rest, columns.doubt, starts)
-    there = np.concatenate([weight[a + order : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])
-    fewer = [max(0, a - order * run) for run, a in enumerate(starts)]
-    between = _fast_covariance(new, there.astype(float), fewer, order, columns.spacing)[0] / free
+    total = _fast_covariance(rest * weight, weight, starts, order, columns.spacing)[0]
+    plain = plain._replace(std=np.maximum(np.sqrt(np.diag(total) / free), 1e-12))
+
+    def whiten(follow: np.ndarray) -> tuple[NoiseShape, np.ndarray, np.ndarray]:
+        shape = plain._replace(follow=follow)
+        new, memory = shape.prewhiten(rest, columns.doubt, starts), len(follow)
+        there = np.concatenate([weight[a + memory : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])
+        fewer = [max(0, a - memory * run) for run, a in enumerate(starts)]
+        return shape, new, _fast_covariance(new, there.astype(float), fewer, order, columns.spacing), there, fewer
+
+    passed = follow_low_pass(columns)
+    _, new, covariance, *_ = whiten(np.tile(passed[:, None], drives))
+    echo = np.diagonal(covariance, axis1=1, axis2=2)
+    own = [_autoregression(c, order) for c in echo.T]
+    follow = np.column_stack([-np.convolve(np.append(1.0, -passed), np.append(1.0, -one))[1:] for one in own])
+    plain, new, covariance, there, fewer = whiten(follow)
+    between = covariance[0] / free
     ratio = np.sqrt(_usual_fraction(new, there, fewer, max(1, round(MEMORY / columns.spacing))))
     size, ways = np.linalg.eigh(between * np.outer(ratio, ratio))
     white = (ways / np.sqrt(np.maximum(size, 1e-12 * size.max()))) @ ways.T
     return plain._replace(white=white, std=ratio * plain.std)
+
+
+def follow_low_pass(columns: Columns) -> np.ndarray:
+    """Return the autoregression (q,) of white noise after the low-pass and decimation of the forces."""
+    taps, thin = design_low_pass(columns.band, columns.row)
+    echo = np.correlate(taps, taps, "full")[len(taps) - 1 :: thin]
+    return _autoregression(echo, max(1, int(MEMORY / columns.spacing)))
+
+
+def _autoregression(covariance: np.ndarray, order: int) -> np.ndarray:
+    """Autoregression (order,) of a process with an autocovariance at lags 0, 1, ..., and none at larger lags.
+
+    The spectrum of an estimated covariance may be negative somewhere; it is at least a fraction of its mean.
+    """
+    if not covariance[0] > 0.0:
+        return np.zeros(order)
+    spectrum = np.fft.hfft(covariance, 8 * (order + len(covariance)))
+    echo = np.fft.ihfft(np.maximum(spectrum, _LEAST_NOISE * spectrum.mean())).real
+    return solve_toeplitz(echo[:order], echo[1 : order + 1])
 
 
 def _usual_fraction(new: np.ndarray, there: np.ndarray, starts: Sequence[int], length: int) -> np.ndarray:
@@ -296,6 +328,8 @@ class ForceEvidence(GapModel):
         self.columns, self.shape, order = columns, shape, len(shape.follow)
         self.run_names = ()
         self.keep: Callable[[Judged], None] = lambda judged: None
+        alike = [LevelScale(size, size) for size in RESIDUAL_SCALES]
+        self.level_scales = (*alike, *(LevelScale(1.0, size) for size in (*RESIDUAL_SCALES[1:], 0.0)))
         self.max_effects = max(_MIN_EFFECTS, _EFFECTS_PER_DRIVE * columns.gap.shape[1])
         wide = typical_sizes(columns)
         self._unit = np.where(wide > 0.0, wide, 1.0)
@@ -385,7 +419,7 @@ class ForceEvidence(GapModel):
             inner = self._inner(square[count:, count:], levels)
             size, ways = np.linalg.eigh(square[:count, :count] - cross.T @ np.linalg.solve(inner, cross))
             wide = 2.0 * float(np.log(spread).sum()) + float(np.linalg.slogdet(inner)[1])
-            if len(self._roots) >= 2 * self.max_effects:
+            if len(self._roots) >= len(self.level_scales) * self.max_effects:
                 self._roots.pop(next(iter(self._roots)))
             self._roots[key] = np.sqrt(np.maximum(size, 0.0))[:, None] * ways.T, wide
         return self._roots[key]
@@ -512,9 +546,9 @@ class ForceEvidence(GapModel):
         fit = self.fit(judged.guess)
         return judged, replace(fit, guess=judged.guess)
 
-    def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
+    def refine(self, now: Judged, guess: Guess, scale: LevelScale, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension with scaled residual forces, and re-estimate the levels."""
-        self._levels = _shrink_levels(levels_of(now), residual_scale)
+        self._levels = _shrink_levels(levels_of(now), scale)
         self._root, _ = self._root_of(self._levels)
         fit = self.fit(guess)
         judged = self.judge(fit.guess)
@@ -536,8 +570,8 @@ class ForceEvidence(GapModel):
         )  # fmt: skip
 
     def compare_disturbances(
-        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
-    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        self, judged: Judged, candidates: Sequence[Hypothesis]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, LevelScale]]:
         """Return the most likely force pulse on a drive with a residual force, in one run; its column is added.
 
         A pulse is the difference of two steps, so the Gram matrix of steps at all instants gives the Bayes factor of
@@ -547,7 +581,7 @@ class ForceEvidence(GapModel):
         lacking = np.flatnonzero(self.residual_gain(judged) > _LEAST_PULSE) if self._has_pulses else ()
         columns, rest = self.columns, self._values @ self._sum_columns(judged.guess)
         losses, found = [], []
-        for scale in scales if len(lacking) else ():
+        for scale in self.level_scales[: len(RESIDUAL_SCALES)] if len(lacking) else ():
             levels = _shrink_levels(self._levels, scale)
             levels, value, cost = self._marginalise(rest, levels, [levels.parameter_scale])
             left = rest - self._nuisance @ value
@@ -562,10 +596,23 @@ class ForceEvidence(GapModel):
                     factor, size, start, end = self._best_interval(run, k, near, levels, left)
                     gain = losses[0] - losses[-1] + factor - _CHOICE_OF_INTERVAL
                     found.append((gain, scale, run, k, start, end, size))
-        gain, scale, run, k, start, end, size = max(found, default=(0.0,) * 7)
-        if not gain > 0.0:
+        gain, scale, run, k, start, end, size = max(found, default=(0.0, LevelScale(), *(0.0,) * 5))
+        if not gain > 0.0 or self._depends_on_motion(judged, int(k), max(f[0] for f in found if f[1].residual == 1.0)):
             return []
         return [((self._pulse(judged.guess, int(run), int(k), start, end), np.array([size])), gain, scale)]
+
+    def _depends_on_motion(self, judged: Judged, drive: int, gain: float) -> bool:
+        """Return whether a law over a position or rate explains the errors of a drive better than a pulse.
+
+        Args:
+            judged: the base.
+            drive: index of the drive.
+            gain: twice the log Bayes factor of the pulse.
+        """
+        force = np.zeros(self.columns.gap.shape)
+        force[:, drive] = self._pulse_size(drive)
+        factors, _ = self.compare_laws(judged, force, [[values] for values in self.columns.states.values()])
+        return float(factors.max()) > gain
 
     def _best_interval(
         self, run: int, drive: int, times: np.ndarray, levels: ForceLevels, left: np.ndarray
@@ -652,9 +699,22 @@ class ForceEvidence(GapModel):
         return along, covariance * np.outer(wide, wide)
 
     def covariance(self, judged: Judged) -> np.ndarray:
-        """Return the covariance (P, P) of the deviations of the effects."""
-        count = len(judged.guess.deviation)
-        return self._posterior(judged)[1][:count, :count]
+        """Return the covariance (P, P) of the deviations of the effects about those of a model.
+
+        It is averaged over the scale of the uncertain parameters: the most likely scale alone would make it too small.
+        """
+        count, losses, found = len(judged.guess.deviation), [], []
+        for scale in self._choices if np.any(~self._is_form) else (levels_of(judged).parameter_scale,):
+            self.set_base(judged)
+            one = self._judge(judged.guess, (scale,))
+            self.set_base(one)
+            fit = self.fit(judged.guess)
+            losses.append(self._judge(fit.guess, (scale,)).loss + fit.whole_penalty)
+            off = fit.guess.deviation - judged.guess.deviation
+            found.append(self._posterior(one)[1][:count, :count] + np.outer(off, off))
+        self.set_base(judged)
+        weights = np.exp(-0.5 * (np.array(losses) - min(losses)))
+        return np.einsum("s,sij->ij", weights / weights.sum(), np.array(found))
 
     def uncertainty(self, judged: Judged) -> np.ndarray:
         """Return a root (m, r) of the covariance along the columns of all that was estimated."""
@@ -753,9 +813,9 @@ class ForceLinearisation:
         """Return the same."""
         return self
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
+    def equations(self, scale: LevelScale, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return the normal equations from the sums of squares at scaled residual forces."""
-        root, wide = self.evidence._root_of(_shrink_levels(self.evidence._levels, residual_scale))
+        root, wide = self.evidence._root_of(_shrink_levels(self.evidence._levels, scale))
         groups = [root @ g for g in self.groups]
         if joined:
             groups = [np.hstack([groups[g] for g in joined])]
@@ -763,9 +823,10 @@ class ForceLinearisation:
         return [NormalEquations.of(-errors, groups, root @ self.nuisance)], float(errors @ errors) + wide
 
 
-def _shrink_levels(levels: ForceLevels, ratio: float) -> ForceLevels:
+def _shrink_levels(levels: ForceLevels, scale: LevelScale) -> ForceLevels:
     """Scale what stands in for missing effects: residual forces and uncertain parameters."""
-    return replace(levels, sizes=ratio * levels.sizes, parameter_scale=ratio * levels.parameter_scale)
+    sizes, parameters = scale.residual * levels.sizes, scale.parameters * levels.parameter_scale
+    return replace(levels, sizes=sizes, parameter_scale=parameters)
 
 
 def _level_prior(x: np.ndarray) -> float:

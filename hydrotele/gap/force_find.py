@@ -24,20 +24,19 @@ from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
-from hydrotele.gap.find import Progress, verdict_of, without_details
-from hydrotele.gap.force_columns import ForceEffect, force_effects
+from hydrotele.gap.find import Progress, verdict_of
+from hydrotele.gap.force_columns import SENTENCES, ForceEffect, force_effects
 from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
-    SENTENCES,
     TYPICAL,
     Columns,
     Key,
     build_columns,
     common_band,
     force_unit,
+    nominal_parameters,
     undone,
 )
-from hydrotele.gap.mechanism_find import MechanismModel, nominal_parameters
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
 from hydrotele.gap.patched import (
     COLUMNS_FILE,
@@ -48,7 +47,6 @@ from hydrotele.gap.patched import (
     sensor_errors,
     write_mechanism,
 )
-from hydrotele.gap.residuals import believed_part
 from hydrotele.gap.result import (
     LIKELY,
     Alternative,
@@ -90,8 +88,29 @@ _DIFFERS = (
     "{} at {}, found on the fitted runs, differs between parts of these runs ({:.2g} to {:.2g} times the fitted value,"
     " twice the log Bayes factor against a constant value {:.0f}); it was rejected."
 )
+_MINOR = (
+    "{} at {} ({}) is in the patched model, because it explains a part of the force errors, but is not named: it is"
+    " small, or something else probably causes them."
+)
 _HELD_OUT_ONLY = "A force of {:.3g} {} RMS acts on {} in the held-out run {} alone; the fitted runs do not show it."
 METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
+
+
+@dataclass(frozen=True)
+class MechanismModel:
+    """A mechanism as a model that a gap is found against.
+
+    Attributes:
+        name: of the MJCF.
+        mjcf: the XML.
+        mapping: its columns.
+        tool: empty; machines have one.
+    """
+
+    name: str
+    mjcf: str
+    mapping: ColumnMapping
+    tool: str = ""
 
 
 class _Task(NamedTuple):
@@ -189,31 +208,21 @@ def find_force_gap(
     evidence, found = _search(task, effects, tell)
     tell("evaluate the patched model on the held-out run", 0.9)
     chances = _probabilities(evidence, found)
-    small = {h.key: _not_named(h.key, dict(zip(h.parameters, v, strict=True)))
-             for h, v in task.effects_of(found.guess) if _is_small(h, v)}  # fmt: skip
-    judged, untrue = _remove_effects(evidence, found.judged, small), list(small.values())
+    small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)}
+    judged, untrue = found.judged, list[str]()
     varying: dict[Key, str] = {}
     while varying := _varying(evidence, judged):
         untrue += varying.values()
         judged = _remove_effects(evidence, judged, varying)
-    details: tuple[NamedEffect, ...] = ()
-    is_rejected = False
-    then = build_columns([heldout], mechanism, task.band)
+    then, is_rejected = build_columns([heldout], mechanism, task.band), False
     result = _evaluate(task, evidence, judged, then)
-    while True:
-        if not _error_ratio(task, evidence, result) <= _WORSE:
-            is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
-            evidence, found = _given_model(task)
-            result = _evaluate(task, evidence, found.judged, then)
-        named = _describe_effects(task, evidence, result, chances)
-        named, more = without_details(named, bool(result.is_lacking.any()), task.drives)
-        unlikely = tuple(e for e in named if e.mechanism_probability < LIKELY)
-        named, more = tuple(e for e in named if e not in unlikely), (*more, *unlikely)
-        details += more
-        if not more:
-            break
-        judged = _remove_effects(evidence, result.judged, {(e.name, e.location) for e in more})
-        result = _evaluate(task, evidence, judged, then)
+    if not _error_ratio(task, evidence, result) <= _WORSE:
+        is_rejected, untrue = True, [*untrue, _REJECTED]  # a gap of the fitted runs remains
+        evidence, found = _given_model(task)
+        result = _evaluate(task, evidence, found.judged, then)
+    described = _describe_effects(task, evidence, result, chances)
+    named = tuple(e for e in described if e.mechanism_probability >= LIKELY and (e.name, e.location) not in small)
+    minor = tuple(e for e in described if e not in named)
     result = _compare_heldout(result, mechanism.setup.chain, nominal)
     shape, rows = evidence.shape, slice(0, min(len(result.then.time), len(result.now.time)))
     before, after = (_predictions(task, evidence, shape, result, rows, which) for which in (False, True))
@@ -227,7 +236,7 @@ def find_force_gap(
     total = [float(np.sqrt(np.mean(one**2))) for one in rms]
     more = [
         f"Forces are compared below {task.band:.3g} Hz.",
-        *(_not_named((e.name, e.location), {k: v.value for k, v in e.parameters.items()}) for e in details),
+        *(_MINOR.format(e.name, e.location, _numbers({k: v.value for k, v in e.parameters.items()})) for e in minor),
     ]
     of_fit, of_heldout = result.is_lacking
     more += [_HELD_OUT_ONLY.format(result.sizes[1, k], task.unit(drive), drive, heldout.name)
@@ -249,7 +258,7 @@ def find_force_gap(
         noise={c: (float(std), float("nan")) for c, std in zip(_channels(task), shape.std, strict=True)},
         notes=(*notes, *untrue, *more), differences=result.differences, answers=tuple(answer_document(named)),
         explanation=VerdictExplanation(
-            compare_contenders(found, named), _rejections(found, named, details, untrue),
+            compare_contenders(found, named), _rejections(found, named, minor, untrue),
             _traces(task, evidence, result),
         ),
         seconds=time.perf_counter() - begin,
@@ -287,7 +296,7 @@ def uncertain_form(mechanism: Mechanism, columns: Columns, about: Mapping[str, f
         columns: of the runs.
         about: parameter -> how much it differs from the given one, as far as is known.
     """
-    form = {"delay.force": 0.5 * columns.row}
+    form = {"delay.force": columns.row / math.sqrt(12.0)}  # uniform over a row
     for one in mechanism.setup.friction_terms:
         found = about.get(f"coulomb.{one.location}", 0.0)
         dry = abs(one.nominal.get("coulomb", 0.0) + found) + abs(one.nominal.get("stribeck", 0.0))
@@ -368,9 +377,8 @@ def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
     return float(np.linalg.norm(change)) < 1.0
 
 
-def _not_named(key: Key, values: Mapping[str, float]) -> str:
-    told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-    return f"{key[0]} at {key[1]} ({told}) is too small or unlikely to be named; the patched model does not contain it."
+def _numbers(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
 
 
 def _remove_effects(evidence: ForceEvidence, judged: Judged, dropped: Collection[Key]) -> Judged:
@@ -476,10 +484,17 @@ def _compare_heldout(result: _Result, chain: Chain, nominal: Mapping[str, float]
 
 
 def _missing_forces(evidence: ForceEvidence, judged: Judged) -> np.ndarray:
-    """RMS (k,) of the residual forces of a model, 0 where they bring no evidence [N] or [N m]."""
+    """RMS (k,) of the forces that are missing in a model [N] or [N m], 0 where they bring no evidence.
+
+    Errors that the readings do not allow as noise are a missing force that varies quickly.
+    """
+    largest = evidence.columns.max_noise / evidence.shape.std
     noise = judged.tracks[0].levels.noise
-    found = evidence.shape.missing_forces(evidence.remaining_force(judged), evidence.columns.doubt, noise)
-    return np.where(evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR, found, 0.0)
+    found = evidence.shape.missing_forces(
+        evidence.remaining_force(judged), evidence.columns.doubt, np.minimum(noise, largest)
+    )
+    is_there = (evidence.residual_gain(judged) > MIN_LOG_BAYES_FACTOR) | (noise > largest)
+    return np.where(is_there, found, 0.0)
 
 
 def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float:
@@ -494,8 +509,8 @@ def _error_ratio(task: _Task, evidence: ForceEvidence, result: _Result) -> float
 def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[float, tuple[Alternative, ...]]]:
     """Effect -> its probability, and those of its alternatives.
 
-    The probability against rivals and none is scaled with that of the fraction of the variance of the missing force
-    that the effect explains, on the drive that it moves most.
+    If a force is still missing on the drive that the effect moves most, the probability against rivals and none is
+    multiplied with the fraction of the variance of the missing force that the effect explains there.
     """
     out = {}
     for index, (hypothesis, deviation) in enumerate(found.guess.parts):
@@ -512,7 +527,7 @@ def _probabilities(evidence: ForceEvidence, found: Found) -> dict[Key, tuple[flo
         own = int(np.argmax(np.sqrt(np.mean(force**2, axis=0)) / evidence.shape.std))
         alike = evidence.judge_alike(rest.guess, found.judged)  # its uncertain parameters must not take the place
         now, without = (_missing_forces(evidence, one)[own] ** 2 for one in (found.judged, alike))
-        trust = believed_part(1.0 - now / without if without > now else 0.0)
+        trust = 1.0 - now / max(now, without) if now > 0.0 else 1.0
         others = tuple(
             Alternative(*r.hypothesis.key, trust * float(chance))
             for r, chance in zip(rivals, table[2:], strict=True) if chance >= _MIN_PROBABILITY
@@ -660,10 +675,10 @@ def _ranking(found: Found) -> tuple[Candidate, ...]:
 
 
 def _rejections(
-    found: Found, named: Sequence[NamedEffect], details: Sequence[NamedEffect], untrue: Sequence[str]
+    found: Found, named: Sequence[NamedEffect], minor: Sequence[NamedEffect], untrue: Sequence[str]
 ) -> tuple[Rejection, ...]:
     """What was tried and not named, with the test that it failed."""
-    out = [Rejection(e.name, e.location, "fraction of the gap closed", e.share, MIN_FORCE_SHARE) for e in details]
+    out = [Rejection(e.name, e.location, "probability", e.mechanism_probability, LIKELY) for e in minor]
     if not found.guess.parts:
         out += [
             Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)

@@ -14,7 +14,7 @@ from hydrotele.estimate.evidence import Fit, Judged
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.dictionary import Version
 from hydrotele.gap.laws import LawForm
-from hydrotele.gap.regression import NormalEquations
+from hydrotele.gap.regression import LevelScale, NormalEquations
 from hydrotele.gap.run_differences import Quantity
 
 
@@ -58,11 +58,11 @@ class Linearisation(Protocol):
         """Return the linearisation of laws instead of versions."""
         ...
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
+    def equations(self, scale: LevelScale, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Return per run the normal equations with scaled residual inputs, and -2 log likelihood of all errors.
 
         Args:
-            residual_scale: factor on the standard deviations of the residual inputs.
+            scale: factors on the noise levels.
             joined: indices of versions that form one group together; one group per version if empty.
         """
         ...
@@ -80,6 +80,9 @@ class GapModel(Protocol):
 
     max_effects: int
     """Number of rounds after which a search ends."""
+
+    level_scales: Sequence[LevelScale]
+    """Factors on the noise levels at which effects are compared."""
 
     run_names: tuple[str, ...]
     """Names of the fitted runs, and the held-out one last."""
@@ -132,13 +135,13 @@ class GapModel(Protocol):
         """
         ...
 
-    def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
+    def refine(self, now: Judged, guess: Guess, scale: LevelScale, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension of a model and re-estimate its noise levels; None if the model cannot follow the runs.
 
         Args:
             now: the model, which is the base before and afterwards.
             guess: its extension.
-            residual_scale: factor on the residual inputs with which the fit begins.
+            scale: factors on the noise levels with which the fit begins.
             dense: whether many parameters are added, whose sensitivities are computed once.
         """
         ...
@@ -165,14 +168,13 @@ class GapModel(Protocol):
         return {}
 
     def compare_disturbances(
-        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
-    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        self, judged: Judged, candidates: Sequence[Hypothesis]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, LevelScale]]:
         """Compare force pulses and periodic forces with none.
 
         Args:
             judged: the base.
             candidates: effects, among them pulses.
-            scales: factors on the residual inputs.
 
         Returns:
             Per disturbance and scale the effect with its deviation (p,), twice its log Bayes factor, and the scale.

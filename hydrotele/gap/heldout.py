@@ -71,7 +71,7 @@ def compare_heldout(evidence: Evidence, found: Found, candidates: Sequence[Hypot
         alone = [between_runs(q, (run.name,), 1.0) for q in list_quantities(data.machine, candidates).values()]
         pulses = [c for c in candidates if is_pulse(c)]
         last, _, _ = add_effects(model, held, [*alone, *pulses], False, lambda text, share: None)
-        if not last.fit:  # nothing, or coloured noise
+        if not last.fit or not last.guess.deviation.size:  # nothing, or coloured noise
             return HeldOut(found, spread, ())
         sizes, first, differences = np.sqrt(np.diag(invert_information(last.fit.information))), 0, []
         for h, d in last.guess.parts:

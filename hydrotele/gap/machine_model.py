@@ -19,7 +19,7 @@ from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
 from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs, states_after_rows
-from hydrotele.gap.regression import OWN_SCALE, NormalEquations, reweight_columns
+from hydrotele.gap.regression import OWN_SCALE, RESIDUAL_SCALES, LevelScale, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
 from hydrotele.machine.machine import Machine
 
@@ -35,6 +35,7 @@ class MachineModel(GapModel):
     """Evidence on the runs of a hydraulic machine, see `gap.gap_model.GapModel`."""
 
     max_effects = _MAX_EFFECTS
+    level_scales = tuple(LevelScale(size) for size in RESIDUAL_SCALES)
 
     def __init__(self, evidence: Evidence) -> None:
         """Take the evidence, with noise levels that it estimates."""
@@ -79,10 +80,10 @@ class MachineModel(GapModel):
         found = fit_until_settled(self.evidence, judged, wanted, _LEAST_GAIN)
         return rescale_between_runs(*found, self.evidence.runs)
 
-    def refine(self, now: Judged, guess: Guess, residual_scale: float, dense: bool) -> tuple[Judged, Fit] | None:
+    def refine(self, now: Judged, guess: Guess, scale: LevelScale, dense: bool) -> tuple[Judged, Fit] | None:
         """Fit an extension on the nonlinear filter and re-estimate its noise levels."""
         evidence = self.evidence
-        tracks = tuple(scale_residual_inputs(t, residual_scale) for t in now.tracks)
+        tracks = tuple(scale_residual_inputs(t, scale.residual) for t in now.tracks)
         evidence.set_base(Judged(now.guess, tracks, now.loss))
         try:
             kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE) if dense else None
@@ -91,7 +92,7 @@ class MachineModel(GapModel):
             if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in added):
                 return None
             evidence.set_base(now)
-            if residual_scale == 1.0:
+            if scale.residual == 1.0:
                 judged = evidence.judged(fit.guess)
             else:
                 judged = evidence.judged_from(fit.guess, tracks[0].levels)
@@ -114,14 +115,14 @@ class MachineModel(GapModel):
         return list_quantities(self.evidence.data.machine, candidates)
 
     def compare_disturbances(
-        self, judged: Judged, candidates: Sequence[Hypothesis], scales: Sequence[float]
-    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, float]]:
+        self, judged: Judged, candidates: Sequence[Hypothesis]
+    ) -> list[tuple[tuple[Hypothesis, np.ndarray], float, LevelScale]]:
         """Compare them on all rows of the runs."""
         evidence, taken = self.evidence, {h.key for h in judged.guess.hypotheses}
         tried = [h for h in list_disturbances(evidence.data, candidates, judged) if h.key not in taken]
         found = []
-        for scale in scales if tried else ():
-            tracks = evidence.map(lambda track, rho=scale: scale_residual_inputs(track, rho), evidence.tracks)
+        for scale in self.level_scales if tried else ():
+            tracks = evidence.map(lambda track, rho=scale.residual: scale_residual_inputs(track, rho), evidence.tracks)
             gained = sum(old.loss - new.loss for old, new in zip(evidence.tracks, tracks, strict=True))
             found += [(part, gained + f, scale) for part, f in compare_disturbances(tried, tracks, evidence.map)]
         return found
@@ -272,7 +273,7 @@ class FilterLinearisation:
         table = self.table.with_laws(laws, self.units, tracks, self.seen_runs, each)
         return dataclasses.replace(self, table=table)
 
-    def equations(self, residual_scale: float, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
+    def equations(self, scale: LevelScale, joined: Sequence[int] = ()) -> tuple[list[NormalEquations], float]:
         """Run the filter again on its own linearisation with the residual inputs scaled."""
         tracks, table = self.tracks, self.table
         groups = table.law_columns if table.laws else table.columns
@@ -283,10 +284,10 @@ class FilterLinearisation:
 
         def of_run(index: int) -> tuple[NormalEquations, float]:
             track, rows = tracks[index], slice(edges[index], edges[index + 1])
-            scaled = scale_residual_inputs(track, residual_scale)
+            scaled = scale_residual_inputs(track, scale.residual)
             columns = np.hstack([*(c[rows] for c in groups), table.nuisance[rows]]).astype(float)
             missing = ~np.isfinite(track.whitened)
-            if residual_scale != 1.0:
+            if scale.residual != 1.0:
                 there = columns.reshape(*track.whitened.shape, -1)
                 there *= np.where(missing, 0.0, track.gains.spread)[:, :, None]
                 reweight_columns(

@@ -3,11 +3,9 @@
 Inverse dynamics of the measured motion tells the drives' forces; what is measured beyond them is
 the gap. Parameters of bodies and friction enter linearly; defects of sensors, a tilt of the base
 and springs have columns by small differences about what is known of them.
-
-Effects that a mechanism can have and its model can lack: names, places, numbers, columns.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import Parameter
+from hydrotele.estimate.levels import STATED_WIDTH
 from hydrotele.identify.equations import (
     RateErrors,
     apply_low_pass,
@@ -46,7 +44,9 @@ _LATE, _AWAY, _TILT = 0.01, 1e-3, 0.01  # s, of a joint's travel, rad: the small
 _RESOLVED = 5e-3  # s, over which positions are averaged before it is asked what they resolve
 _WIDEST = 25.0  # Hz: what is faster tells of drives and sensors, not of a mechanism
 _SLOWEST = 8.0  # rows of one run that a band leaves at least
+TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
 _WHERE = "gap"
+Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ class Columns:
         runs: names.
         drives: names of the k drives.
         units: of their forces.
+        max_noise: (k,) largest plausible noise of the low-passed forces [N] or [N m].
     """
 
     names: tuple[str, ...]
@@ -86,22 +87,12 @@ class Columns:
     runs: tuple[str, ...]
     drives: tuple[str, ...]
     units: tuple[str, ...] = ()
+    max_noise: np.ndarray | float = np.inf
 
     @property
     def gap(self) -> np.ndarray:
         """(n, k) measured less modelled."""
         return self.measured - self.modelled
-
-    def part(self, first: int, last: int) -> "Columns":
-        """Equations `first` to `last`, of one run, as if they were all."""
-        rows = slice(first, last)
-        run = self.runs[int(np.searchsorted(self.starts, first, side="right")) - 1]
-        return replace(
-            self, matrix=self.matrix[rows], measured=self.measured[rows],
-            modelled=self.modelled[rows], time=self.time[rows], starts=(0, last - first),
-            doubt=self.doubt[rows], runs=(run,),
-            states={name: values[rows] for name, values in self.states.items()},
-        )  # fmt: skip
 
     def moved(self, value: Mapping[str, float]) -> "Columns":
         """Columns whose model has some coefficients, column -> value, added."""
@@ -224,8 +215,24 @@ def build_columns(
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
         states, sizes, band, parts[0][7], row, tuple(r.name for r in records), tuple(setup.chain.drives),
-        tuple(force_unit(setup.chain, drive) for drive in setup.chain.drives),
+        tuple(force_unit(setup.chain, drive) for drive in setup.chain.drives), _max_noise(records, band),
     )  # fmt: skip
+
+
+def _max_noise(records: Sequence[IdentificationRecord], band: float) -> np.ndarray:
+    """Return the noise (k,) of the low-passed forces that the readings allow with 95 %, coloured noise included.
+
+    The noise of a reading is the stated one, or that of third differences of the readings.
+    """
+    low, _ = design_low_pass(band, records[0].period)
+    squares = []
+    for record in records:
+        steps = np.abs(np.diff(record.force, n=3, axis=0))
+        rough = 1.4826 * np.nanmedian(steps, axis=0) / np.sqrt(20.0)  # of normal noise; robust against jumps
+        is_stated = np.isfinite(record.force_noise)
+        width = np.where(is_stated, STATED_WIDTH, 2.0 * STATED_WIDTH)
+        squares.append((np.where(is_stated, record.force_noise, rough) * np.exp(2.0 * width)) ** 2)
+    return np.sqrt(np.sum(low**2) * np.mean(squares, axis=0))
 
 
 def force_unit(chain: Chain, joint: str) -> str:
@@ -287,7 +294,7 @@ def _run_columns(
     names, slow = late.columns(sizes)
     extra = _onto(slow, band, record.period * stride, own.time)
     fine = np.stack([motion.value, motion.rate, motion.acceleration])
-    of_drives, quick = _drive_columns(setup, fine, sizes, (table.nominal, value), record.period)
+    of_drives, quick = _drive_columns(setup, fine, motion.rate_std, sizes, (table.nominal, value), record.period)
     quick = _onto(quick, band, record.period, own.time)
     rubs, turns, calm = _dry_friction(setup, fine, band, record.period)
     turns, calm = (_onto(one, band, record.period, own.time) for one in (turns, calm))
@@ -318,7 +325,7 @@ def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
 
-def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, values, period: float):
+def _drive_columns(setup: RegressorSetup, motion: np.ndarray, rate_std: np.ndarray, sizes, values, period: float):
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m).
 
     A scale has the forces of the given parameters, the first of `values`: with friction that was found, it could take
@@ -326,11 +333,7 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, values, per
     """
     chain = setup.chain
     found = setup.project_motion_on_drives(*motion)
-    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
-    given, base = (
-        setup.compute_regressor(found).matrix @ np.array(values).T
-        + np.einsum("nkv,nv->nk", found.joint_projection, passive)[:, :, None]
-    ).transpose(2, 0, 1)
+    given, base = (predict_forces(setup, motion, numbers, rate_std) for numbers in values)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
     for k, drive in enumerate(chain.drives):
@@ -446,80 +449,27 @@ def tilted(gravity: np.ndarray, turn: np.ndarray) -> np.ndarray:
     )  # fmt: skip
 
 
-SENTENCES = {
-    "coulomb_friction": "different Coulomb friction of a joint",
-    "viscous_friction": "different viscous friction of a joint",
-    "stribeck_friction": "additional friction of a drive near zero velocity",
-    "friction_asymmetry": "viscous friction that depends on the direction of a drive",
-    "speed_dependent_force": "resistance proportional to the square of the speed",
-    "joint_spring": "a spring in the joint of a drive",
-    "drive_inertia": "different inertia of a drive",
-    "payload": "an additional mass on a body (negative: the mass of the model is too large)",
-    "com_offset": "an offset of a body's centre of mass",
-    "inertia_error": "different moments of inertia of a body about its centre of mass",
-    "base_tilt": "a tilt of the base",
-    "force_pulse": "a constant force on a drive for a limited time in one run",
-    "force_offset": "a constant in a drive's force: an offset of its sensor, or a constant load",
-    "force_scale": "a scale error of a force sensor",
-    "force_delay": "a delay of a force sensor",
-    "angle_offset": "an offset of an angle sensor",
-    "length_offset": "an offset of a position sensor",
-    "angle_delay": "a delay of an angle sensor",
-    "length_delay": "a delay of a position sensor",
-    "clock_offset": "a delay of all forces relative to the positions (negative: of the positions)",
-}
-TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
-_MOST = 20.0  # times the typical size, where a search ends
-_FORM = 0.2  # of a drive's dry friction, which its form near rest may change
-_NONE = 1e-9  # share that has no effect
-_ASIDE = 0.3  # of its radius of gyration that a body's centre of mass is aside, typically
-_NOTABLE = 0.2  # of a body's moments of inertia that is worth naming, little as forces may change
-_SECOND = 0.1  # s, beyond which no sensor is late
+def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
+    """Regressor's parameter -> its given value, of the setup with a column for everything.
 
-Key = tuple[str, str]
+    Args:
+        mechanism: the model.
 
-
-@dataclass(frozen=True)
-class MechanismEffect:
-    """An effect at a place.
-
-    Attributes:
-        name: see `SENTENCES`.
-        location: a joint, a drive, a body, `force` or `base`.
-        parameters: name -> number, with its prior (`scale` about `start`) and its bounds.
-        columns: those that it acts through.
-        coefficients: (p,) parameters -> (c,) what they add to the given model along the columns.
-        start: (p,) mean of the prior.
-        variant: number of the form, where there are several.
+    Returns:
+        The values; bodies' ten parameters are about their frames' origins.
     """
-
-    name: str
-    location: str
-    parameters: Mapping[str, Parameter]
-    columns: tuple[str, ...]
-    coefficients: Callable[[np.ndarray], np.ndarray]
-    start: np.ndarray
-    variant: int = 0
-
-    @property
-    def key(self) -> Key:
-        """Name and place."""
-        return self.name, self.location
-
-    @property
-    def scale(self) -> np.ndarray:
-        """(p,) standard deviations of the prior."""
-        return np.array([one.prior_std for one in self.parameters.values()])
-
-    @property
-    def low(self) -> np.ndarray:
-        """(p,) smallest values."""
-        return np.array([one.lower_bound for one in self.parameters.values()])
-
-    @property
-    def high(self) -> np.ndarray:
-        """(p,) largest values."""
-        return np.array([one.upper_bound for one in self.parameters.values()])
+    setup = separate_setup(mechanism.setup)
+    chain = setup.chain
+    out = {
+        f"{kind}.{body}": float(value)
+        for body, row in zip(chain.bodies, chain.inertia, strict=True)
+        for kind, value in zip(BODY_PARAMETERS, row, strict=True)
+    }
+    for one in setup.friction_terms:
+        out |= {f"{kind}.{one.location}": float(value) for kind, value in one.nominal.items()}
+    for joint in setup.drive_inertia:
+        out[f"drive_inertia.{joint}"] = float(chain.armature[chain.index(joint)])
+    return out
 
 
 def strengths(columns: Columns) -> np.ndarray:
@@ -527,26 +477,6 @@ def strengths(columns: Columns) -> np.ndarray:
     force = np.sqrt(np.mean(columns.measured**2, axis=0))
     moved = np.sqrt(np.mean(columns.matrix**2, axis=0))
     return (moved / np.maximum(force, 1e-12)[:, None]).max(axis=0)
-
-
-def mechanism_effects(
-    chain: Chain, columns: Columns, nominal: Mapping[str, float],
-    applied: Mapping[Key, np.ndarray],
-) -> list[MechanismEffect]:  # fmt: skip
-    """All effects that can show in some runs.
-
-    Args:
-        chain: the given mechanism.
-        columns: of the runs.
-        nominal: parameter of the regressor -> its given value.
-        applied: sensor effect -> its numbers, where they are taken off the readings.
-
-    Returns:
-        The effects. Those that move no drive's force are left out.
-    """
-    build = _Builder(chain, columns, nominal, applied)
-    out = [*build.joints(), *build.bodies(), *build.sensors()]
-    return [one for one in out if one is not None]
 
 
 def undone(columns: Columns, applied: Mapping[Key, np.ndarray], name_of: Mapping[Key, str]):
@@ -569,217 +499,3 @@ def undone(columns: Columns, applied: Mapping[Key, np.ndarray], name_of: Mapping
         back = known if key[0] != "force_scale" else 1.0 - 1.0 / known
         value[name_of[key]] = -back
     return columns.moved(value)
-
-
-class _Builder:
-    def __init__(self, chain: Chain, columns: Columns, nominal, applied) -> None:
-        self.chain, self.columns, self.nominal, self.applied = chain, columns, nominal, applied
-        self.strength = dict(zip(columns.names, strengths(columns), strict=True))
-
-    def number(
-        self, column: str, unit: str, nominal: float = 0.0, low: float = -np.inf,
-        factor: float = 1.0,
-    ) -> Parameter | None:  # fmt: skip
-        """A parameter of which a unit adds `factor` along a column; None without effect."""
-        share = self.strength.get(column, 0.0) * abs(factor)
-        if share < _NONE:
-            return None
-        scale = TYPICAL / share
-        return Parameter(
-            unit, nominal, max(low, nominal - _MOST * scale), nominal + _MOST * scale, scale,
-            LEAST / share,
-        )  # fmt: skip
-
-    def linear(
-        self, name: str, place: str, parameter: str, column: str, unit: str, nominal: float = 0.0,
-        low: float = -np.inf, variant: int = 0,
-    ) -> MechanismEffect | None:  # fmt: skip
-        facts = self.number(column, unit, nominal, low)
-        if facts is None:
-            return None
-        return MechanismEffect(
-            name, place, {parameter: facts}, (column,), lambda p: p - nominal, np.array([nominal]),
-            variant,
-        )  # fmt: skip
-
-    def units(self, joint: str) -> tuple[str, str, str, str]:
-        """Of force, position, rate and inertia of a joint or a closure."""
-        straight = joint in self.chain.joints and self.chain.tree.is_slide[self.chain.index(joint)]
-        return ("N", "m", "m/s", "kg") if straight else ("N m", "rad", "rad/s", "kg m^2")
-
-    def joints(self):
-        """Friction, springs and inertia."""
-        for place in (*self.chain.joints, *self.chain.closures):
-            force, length, _, inertia = self.units(place)
-            for name, kind, unit, low in (
-                ("coulomb_friction", "coulomb", force, 0.0),
-                ("viscous_friction", "viscous", f"{force} s/{length}", 0.0),
-                ("friction_asymmetry", "viscous_asymmetry", f"{force} s/{length}", -np.inf),
-                ("speed_dependent_force", "quadratic", f"{force} s^2/{length}^2", 0.0),
-                ("drive_inertia", "drive_inertia", inertia, 0.0),
-            ):
-                if kind == "drive_inertia" and place not in self.chain.drives:
-                    continue
-                column = f"{kind}.{place}"
-                given = self.nominal.get(column, 0.0)
-                yield self.linear(name, place, kind, column, unit, given, min(low, given))
-            if place not in self.chain.drives:
-                continue
-            for variant in range(len(STRIBECK)):
-                one = self.linear(
-                    "stribeck_friction", place, "stribeck", f"stribeck{variant}.{place}", force,
-                    0.0, 0.0, variant,
-                )  # fmt: skip
-                yield one and self.sliding(one)
-            yield self.spring(place)
-
-    def sliding(self, one: MechanismEffect) -> MechanismEffect:
-        """Stribeck's effect, not worth naming below a part of dry friction.
-
-        The form of that near rest (sticking, presliding) is never known as well as far from it.
-        """
-        (facts,) = one.parameters.values()
-        least = max(facts.min_relevant_change, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
-        return replace(one, parameters={"stribeck": replace(facts, min_relevant_change=least)})
-
-    def spring(self, drive: str) -> MechanismEffect | None:
-        force, length, _, _ = self.units(drive)
-        j = self.chain.index(drive)
-        stiff, rest = float(self.chain.stiffness[j]), float(self.chain.spring_rest[j])
-        middle, travel, _ = self.columns.sizes.get(drive, (rest, 1.0, 1.0))
-        facts = self.number(f"spring.{drive}", f"{force}/{length}", stiff, 0.0)
-        if facts is None:
-            return None
-        centre = rest if stiff else middle
-        slack = Parameter(length, centre, centre - 3 * travel, centre + 3 * travel, travel, 0.0)
-
-        def coefficients(p: np.ndarray) -> np.ndarray:
-            return np.array([p[0] - stiff, p[0] * (middle - p[1]) - stiff * (middle - rest)])
-
-        return MechanismEffect(
-            "joint_spring", drive, {"stiffness": facts, "rest": slack},
-            (f"spring.{drive}", f"offset.{drive}"), coefficients, np.array([stiff, centre]),
-        )  # fmt: skip
-
-    def bodies(self):
-        """Payload, centre of mass and inertia."""
-        for k, body in enumerate(self.chain.bodies):
-            names = tuple(f"{kind}.{body}" for kind in BODY_PARAMETERS)
-            if any(name not in self.strength for name in names):
-                continue
-            given = self.chain.inertia[k]
-            mass = float(given[0])
-            about = _matrix(given[4:])
-            centre = given[1:4] / mass if mass > 0.0 else np.zeros(3)
-            size = float(np.sqrt(max(np.trace(about), 0.0) / (2.0 * mass))) if mass > 0.0 else 0.0
-            size = max(size, 0.02)  # m
-            yield self.payload(body, names, mass, centre, size)
-            if mass <= 0.0:
-                continue
-            yield self.move_mass(body, names[1:], mass, centre, size)
-            own = about - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-            yield self.turn_inertia(body, names[4:], own)
-
-    def payload(self, body, names, mass, centre, size) -> MechanismEffect | None:
-        move = max(self.strength[n] for n in names[1:4])
-        share = max(self.strength[names[0]], move * size)
-        if share < _NONE:
-            return None
-        scale = TYPICAL / share
-        load = Parameter("kg", 0.0, -0.9 * mass, _MOST * scale, scale, LEAST / share)
-        place = {
-            axis: Parameter("m", c, c - 3.0 * size, c + 3.0 * size, size, 0.0)
-            for axis, c in zip("xyz", centre.tolist(), strict=True)
-        }
-
-        def coefficients(p: np.ndarray) -> np.ndarray:
-            return np.concatenate([[p[0]], p[0] * p[1:], p[0] * _point(p[1:])])
-
-        return MechanismEffect(
-            "payload", body, {"mass": load, **place}, names, coefficients,
-            np.concatenate([[0.0], centre]),
-        )  # fmt: skip
-
-    def move_mass(self, body, names, mass, centre, size) -> MechanismEffect | None:
-        share = mass * max(self.strength[n] for n in names[:3])
-        if share < _NONE:
-            return None
-        scale = min(TYPICAL / share, _ASIDE * size)
-        way = Parameter("m", 0.0, -2.0 * size, 2.0 * size, scale, LEAST / share)
-
-        def coefficients(p: np.ndarray) -> np.ndarray:
-            change = mass * (_point(centre + p) - _point(centre))
-            return np.concatenate([mass * p, change])
-
-        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3))
-
-    def turn_inertia(self, body, names, own) -> MechanismEffect | None:
-        upper = own[np.triu_indices(3)]
-        share = max(self.strength[n] * abs(x) for n, x in zip(names, upper, strict=True))
-        if share < _NONE:
-            return None
-        scale = min(TYPICAL / share, 1.0)
-        least = min(LEAST / share, _NOTABLE)
-        ratio = Parameter("1", 1.0, 0.05, 1.0 + _MOST * scale, scale, least)
-        return MechanismEffect(
-            "inertia_error", body, {"ratio": ratio}, names, lambda p: (p[0] - 1.0) * upper,
-            np.ones(1),
-        )  # fmt: skip
-
-    def sensors(self):
-        """Defects of sensors, and the base."""
-        for drive in self.chain.drives:
-            force = self.units(drive)[0]
-            yield self.linear("force_offset", drive, "offset", f"offset.{drive}", force)
-            yield self.scale(drive)
-            yield self.delay("force_delay", drive, f"delay.force.{drive}", 0.0)
-        yield self.delay("clock_offset", "force", "delay.force", -_SECOND)
-        for joint in self.columns.sizes:
-            unit, kind = self.units(joint)[1], "length" if self.units(joint)[1] == "m" else "angle"
-            column = f"offset.position.{joint}"
-            yield self.linear(f"{kind}_offset", joint, "offset", column, unit)
-            yield self.delay(f"{kind}_delay", joint, f"delay.position.{joint}", 0.0)
-        yield self.tilt()
-
-    def delay(self, name: str, place: str, column: str, low: float) -> MechanismEffect | None:
-        facts = self.number(column, "s")
-        if facts is None:
-            return None
-        facts = Parameter("s", 0.0, low, _SECOND, min(facts.prior_std, 0.02), facts.min_relevant_change)
-        return MechanismEffect(name, place, {"delay": facts}, (column,), lambda p: p, np.zeros(1))
-
-    def scale(self, drive: str) -> MechanismEffect | None:
-        column = f"scale.force.{drive}"
-        if self.number(column, "1") is None:
-            return None
-        known = float(self.applied.get(("force_scale", drive), [1.0])[0])
-        facts = Parameter("1", 1.0, 0.2, 5.0, 0.2, LEAST)
-        return MechanismEffect(
-            "force_scale",
-            drive,
-            {"scale": facts},
-            (column,),
-            lambda p: (p - 1.0) / known,
-            np.ones(1),
-        )
-
-    def tilt(self) -> MechanismEffect | None:
-        share = max(self.strength["tilt.x"], self.strength["tilt.y"])
-        if share < _NONE:
-            return None
-        way = Parameter("rad", 0.0, -0.3, 0.3, 0.03, LEAST / share)
-        return MechanismEffect(
-            "base_tilt", "base", {"x": way, "y": way}, ("tilt.x", "tilt.y"), lambda p: p,
-            np.zeros(2),
-        )  # fmt: skip
-
-
-def _point(place: np.ndarray) -> np.ndarray:
-    """Inertia (6,) of a unit mass at a place, about the origin."""
-    x, y, z = place
-    return np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
-
-
-def _matrix(upper: np.ndarray) -> np.ndarray:
-    xx, xy, xz, yy, yz, zz = upper
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

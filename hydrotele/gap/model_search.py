@@ -24,6 +24,7 @@ from hydrotele.gap.gap_model import GapModel, Linearisation
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior
 from hydrotele.gap.regression import (
     OWN_SCALE,
+    LevelScale,
     Marginal,
     NormalEquations,
     compare_groups,
@@ -45,8 +46,6 @@ from hydrotele.gap.search import Found
 
 MIN_LOG_BAYES_FACTOR = 20.0
 """Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
-RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
-"""Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _JOINT = 40  # best effects among which a pair is looked for
@@ -128,13 +127,13 @@ class Proposal:
     Attributes:
         parts: the effects and the deviations (p,) at which to start; empty for the calibration.
         factor: twice its log Bayes factor, extrapolated from the rows of the linear step to all rows.
-        residual_scale: size of the residual inputs at which it explains the data best.
+        scale: of the noise levels at which it explains the data best.
         parameter_scale: standard deviation of the uncertain parameters; 0 of an effect.
     """
 
     parts: tuple[tuple[Hypothesis, np.ndarray], ...]
     factor: float
-    residual_scale: float
+    scale: LevelScale
     parameter_scale: float = 0.0
 
     @property
@@ -325,12 +324,12 @@ def propose(
     varying: dict[tuple[str, str], Proposal] = {}
     columns = find_columns(table.parameters, table.versions, quantities or {})
     chosen: dict[tuple[str, str], int] = {}
-    gains: dict[float, float] = {}
+    gains: dict[LevelScale, float] = {}
     starts: list[float] = []
 
     def compare(table: Linearisation) -> None:
-        for residual_scale in RESIDUAL_SCALES:
-            by_run, loss = table.equations(residual_scale)
+        for level in model.level_scales:
+            by_run, loss = table.equations(level)
             terms = sum_equations(by_run)
             for parameter_scale in PARAMETER_SCALES[: 1 if not uncertain.size or table.laws else None]:
                 scales = np.where(table.is_own, OWN_SCALE, parameter_scale)
@@ -339,18 +338,18 @@ def propose(
                 starts.append(total)
                 gained = (starts[0] - total) / table.fraction
                 if parameter_scale > 0.0:
-                    _keep(best, Proposal((), gained, residual_scale, parameter_scale))
+                    _keep(best, Proposal((), gained, level, parameter_scale))
                     continue
-                gains[residual_scale] = gained
+                gains[level] = gained
                 for index, part, factor in _compare_columns(table, terms, marginal):
-                    proposal = Proposal((part,), gained + factor / table.fraction, residual_scale)
+                    proposal = Proposal((part,), gained + factor / table.fraction, level)
                     if _keep(best, proposal) and not table.laws:
                         chosen[proposal.key] = index
                 own = () if table.laws else compare_between_runs(by_run, columns, scales, PARAMETER_SCALES[1:])
                 for column, scale, factor, mean in own:
                     group = between_runs(column.quantity, model.run_names, scale)
                     part = group, np.clip(np.append(mean, 0.0), group.low, group.high)  # the held-out run is unknown
-                    _keep(varying, Proposal((part,), gained + factor / table.fraction, residual_scale))
+                    _keep(varying, Proposal((part,), gained + factor / table.fraction, level))
 
     def compare_laws(laws: Sequence[LawForm]) -> None:
         new = [law for law in laws if law.key not in taken]
@@ -367,7 +366,7 @@ def propose(
     single = [p for p in ranked if p.key in chosen]
     if not single:
         return ranked, differing
-    scale = single[0].residual_scale
+    scale = single[0].scale
     pair = propose_pair(table, [chosen[p.key] for p in single[:_JOINT]], scale)
     if pair is None:
         return ranked, differing
@@ -397,26 +396,26 @@ def propose_disturbances(model: GapModel, now: Model, candidates: Sequence[Hypot
         candidates: effects, among them pulses.
     """
     found: dict[tuple[str, str], Proposal] = {}
-    for part, factor, scale in model.compare_disturbances(now.judged, candidates, RESIDUAL_SCALES):
+    for part, factor, scale in model.compare_disturbances(now.judged, candidates):
         _keep(found, Proposal((part,), factor, scale))
     return list(found.values())
 
 
 def propose_pair(
-    table: Linearisation, chosen: Sequence[int], residual_scale: float
+    table: Linearisation, chosen: Sequence[int], scale: LevelScale
 ) -> tuple[tuple[tuple[Hypothesis, np.ndarray], ...], float] | None:
     """Propose two effects that act together, by a sum of single effects.
 
     Args:
         table: linearised versions.
         chosen: one version of each of the best effects.
-        residual_scale: size of the residual inputs.
+        scale: of the noise levels.
 
     Returns:
         The effects with their deviations, and twice the log Bayes factor of both together; None if fewer than two
         components prefer an effect.
     """
-    by_run, _ = table.equations(residual_scale, chosen)
+    by_run, _ = table.equations(scale, chosen)
     chosen_versions = [table.versions[g] for g in chosen]
     marginal = sum_equations(by_run).marginalise(np.where(table.is_own, OWN_SCALE, 0.0))
     edges = np.cumsum([0, *(v.steps.shape[1] for v in chosen_versions)])
@@ -474,7 +473,7 @@ def refine(model: GapModel, now: Model, proposal: Proposal) -> Model | None:
     if dense:
         group = model.uncertain_parameters(guess, proposal.parameter_scale)
         guess = guess.plus(group, np.zeros(group.size)) if group.size else guess
-    found = model.refine(now.judged, Guess((*guess.parts, *proposal.parts)), proposal.residual_scale, dense)
+    found = model.refine(now.judged, Guess((*guess.parts, *proposal.parts)), proposal.scale, dense)
     if (
         found is None
         or linear_factor(found[1], range(len(now.guess.parts), len(found[1].guess.parts))) < MIN_LOG_BAYES_FACTOR

@@ -15,7 +15,7 @@ import yaml
 from hydrotele.core.mjcf import read_mjcf
 from hydrotele.gap.description import effect_title, learned_title, number_title
 from hydrotele.gap.force_columns import ForceEffect
-from hydrotele.gap.mechanism_columns import STRIBECK, MechanismEffect, tilted
+from hydrotele.gap.mechanism_columns import STRIBECK, tilted
 from hydrotele.gap.result import (
     Estimate,
     Gap,
@@ -167,7 +167,7 @@ class Patch:
 
 
 def sensor_errors(
-    found: Sequence[tuple[MechanismEffect | ForceEffect, np.ndarray]], chain: Chain, joints: Sequence[str]
+    found: Sequence[tuple[ForceEffect, np.ndarray]], chain: Chain, joints: Sequence[str]
 ) -> dict[str, SensorError]:
     """Defects of sensors among some effects.
 
@@ -200,7 +200,7 @@ def sensor_errors(
 
 
 def patch_of(
-    found: Sequence[tuple[MechanismEffect | ForceEffect, np.ndarray]], chain: Chain, joints: Sequence[str],
+    found: Sequence[tuple[ForceEffect, np.ndarray]], chain: Chain, joints: Sequence[str],
     calibrated: Mapping[str, float], nominal: Mapping[str, float],
     speeds: Mapping[str, float],
 ) -> Patch:  # fmt: skip

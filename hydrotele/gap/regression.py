@@ -27,6 +27,22 @@ OWN_SCALE = 10.0
 _CONVERGED = 1.0e-3  # prior standard deviations; change of all coefficients that ends the iteration
 
 
+class LevelScale(NamedTuple):
+    """Sizes of what stands in for missing effects, relative to the estimated ones, at which effects are compared.
+
+    Attributes:
+        residual: of the residual inputs.
+        parameters: of the uncertain parameters, if they are part of the noise levels.
+    """
+
+    residual: float = 1.0
+    parameters: float = 1.0
+
+
+RESIDUAL_SCALES = (1.0, 0.3, 0.1, 0.03)
+"""Sizes of the residual inputs, relative to the estimated ones, at which effects are compared."""
+
+
 class Marginal(NamedTuple):
     """Normal equations of all groups with the nuisance parameters marginalised.
 

@@ -13,8 +13,6 @@ from hydrotele.core.files import models_folder
 from hydrotele.gap.force_evidence import estimate_noise
 from hydrotele.gap.force_find import find_force_gap
 from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
-from hydrotele.gap.mechanism_evidence import find_noise
-from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.patched import Patch, patched_mjcf
 from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
 from hydrotele.identify.record import IdentificationRecord
@@ -71,27 +69,17 @@ def logs(folder, xml=ARM, late=0.0, law=None, noise=0.15, seed=0):
     return folder / "logs"
 
 
-@pytest.fixture(params=("search", "regression"))
-def method(request):
-    return request.param
-
-
-FIND = {"search": find_mechanism_gap, "regression": find_force_gap}
-NOISE = {"search": find_noise, "regression": estimate_noise}
-
-
-def found_gap(folder, method, **choices):
+def found_gap(folder, **choices):
     mechanism = load_mechanism(folder / "robot.xml")
     fit, judge, said = load_mechanism_records([folder / "logs"], mechanism, keep_measured_joints=True)
-    return FIND[method](folder / "robot.xml", None, fit, judge, notes=said, **choices)
+    return find_force_gap(folder / "robot.xml", None, fit, judge, notes=said, **choices)
 
 
-def test_the_command_names_a_payload_and_the_patched_model_has_no_gap(tmp_path, method):
+def test_the_command_names_a_payload_and_the_patched_model_has_no_gap(tmp_path):
     load = '<body pos="0.3 0 0.02"><inertial pos="0 0 0" mass="1.1" diaginertia="1e-6 1e-6 1e-6"/>'
     logs(tmp_path, ARM.replace("</body></body>", f"{load}</body></body></body>"))
     out = tmp_path / "out"
     words = ["gap", "--mjcf", tmp_path / "robot.xml", "--data", tmp_path / "logs", "--out", out]
-    words += ["--method", method]
     result = CliRunner().invoke(app, [*map(str, words), "--json"])
     assert result.exit_code == 0, result.output
     found = json.loads((out / "gap.json").read_text())
@@ -104,7 +92,7 @@ def test_the_command_names_a_payload_and_the_patched_model_has_no_gap(tmp_path, 
     loop = found["open_loop"]
     assert sum(loop["after"].values()) < 0.5 * sum(loop["before"].values())
     assert "payload of the fore" in (out / "report.html").read_text()
-    patched = FIND[method](
+    patched = find_force_gap(
         out / "patched" / "robot.xml", out / "patched" / "columns.yaml",
         *load_mechanism_records(
             [tmp_path / "logs"],
@@ -115,9 +103,9 @@ def test_the_command_names_a_payload_and_the_patched_model_has_no_gap(tmp_path, 
     assert patched.verdict == "no_gap" and not patched.effects
 
 
-def test_a_model_that_fits_has_no_gap_and_is_left_alone(tmp_path, method):
+def test_a_model_that_fits_has_no_gap_and_is_left_alone(tmp_path):
     logs(tmp_path)
-    gap = found_gap(tmp_path, method)
+    gap = found_gap(tmp_path)
     assert gap.verdict == "no_gap" and gap.patched is gap.machine and not gap.unknown
 
 
@@ -125,7 +113,7 @@ def test_a_model_that_fits_has_no_gap_and_is_left_alone(tmp_path, method):
 def test_friction_is_named_beside_late_sensors(tmp_path):
     """Both positions are late: how late against the forces is told, not always in fewest names."""
     logs(tmp_path, ARM.replace('frictionloss="0.8"', 'frictionloss="2.4"'), late=0.012)
-    gap = found_gap(tmp_path, "search")
+    gap = found_gap(tmp_path)
     named = {(e.name, e.location): e.parameters for e in gap.effects}
     assert gap.verdict == "named", named
     dry = named["coulomb_friction", "elbow"]["coulomb"]
@@ -151,7 +139,7 @@ def pulses(*runs):
 
 def test_a_force_pulse_in_one_run_is_named(tmp_path):
     logs(tmp_path, law=pulses(1))
-    gap = found_gap(tmp_path, "regression")
+    gap = found_gap(tmp_path)
     (effect,) = gap.effects
     assert gap.verdict == "named" and (effect.name, effect.location) == ("force_pulse", "shoulder.second")
     assert effect.parameters["size"].low <= 3.0 <= effect.parameters["size"].high
@@ -161,7 +149,7 @@ def test_a_force_pulse_in_one_run_is_named(tmp_path):
 
 def test_a_force_pulse_in_the_held_out_run_is_a_difference_of_this_run(tmp_path):
     logs(tmp_path, law=pulses(2))
-    gap = found_gap(tmp_path, "regression")
+    gap = found_gap(tmp_path)
     assert gap.verdict == "no_gap" and not gap.effects
     difference = gap.differences[0]
     assert difference.name == "force_pulse.shoulder.size"
@@ -177,7 +165,7 @@ def test_an_inertia_is_named_beside_parameters_that_are_all_wrong(tmp_path):
     real = real.replace('0.15 0 0.01" mass="2" diaginertia="0.004 0.02 0.02"',
                         '0.1515 0 0.0099" mass="2.02" diaginertia="0.008 0.04 0.04"')  # fmt: skip
     logs(tmp_path, real)
-    gap = found_gap(tmp_path, "regression")
+    gap = found_gap(tmp_path)
     (effect,) = gap.effects
     assert gap.verdict == "named" and (effect.name, effect.location) == ("inertia_error", "fore")
     assert effect.parameters["ratio"].low <= 2.0 <= effect.parameters["ratio"].high
@@ -211,7 +199,7 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
                 data.qfrc_applied[0] = -(1.0 + stribeck * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.002)
             mujoco.mj_step(model, data)
         np.savetxt(tmp_path / "logs" / f"{name}.csv", rows, delimiter=",", header="time,angle.j,torque.j", comments="")
-    gap = found_gap(tmp_path, "regression")
+    gap = found_gap(tmp_path)
     named = {(e.name, e.location): e.parameters for e in gap.effects}
     assert set(named) == {("coulomb_friction", "j")}
     # no effect of the library falls with the rate, so a part of Stribeck's effect may remain
@@ -220,30 +208,30 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
     assert abs(dry - 1.0) < (0.15 if stribeck else 0.01)  # rows near rest, where the effect acts, are left out
 
 
-def test_a_law_outside_the_library_is_located_but_not_named(tmp_path, method):
+def test_a_law_outside_the_library_is_located_but_not_named(tmp_path):
     logs(tmp_path, law=lambda q, v: 4.0 * np.sin(q[:, 0] / 0.12))
-    gap = found_gap(tmp_path, method)
+    gap = found_gap(tmp_path)
     assert gap.verdict == "unknown" and not gap.effects
     assert gap.unknown and gap.unknown.channel == "torque.shoulder"
     assert "position.shoulder" in gap.unknown.depends_on
 
 
 @pytest.mark.nightly
-def test_an_effect_that_differs_from_run_to_run_is_taken_back(tmp_path, method):
+def test_an_effect_that_differs_from_run_to_run_is_taken_back(tmp_path):
     turns = iter((0.5, 3.0, 1.5))  # N m s/rad, run by run
     logs(tmp_path, law=lambda q, v: next(turns) * v[:, 0])
-    gap = found_gap(tmp_path, method)
+    gap = found_gap(tmp_path)
     assert gap.verdict == "unknown" and not gap.effects
     assert any("differs between parts of these runs" in note for note in gap.notes), gap.notes
 
 
-def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path, method):
+def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path):
     turns = iter((-1.5, 3.0, 0.5))  # N m, run by run
     logs(tmp_path, law=lambda q, v: next(turns) + 0.0 * q[:, 0])
     mechanism = load_mechanism(tmp_path / "robot.xml")
     fit, _, _ = load_mechanism_records([tmp_path / "logs"], mechanism, keep_measured_joints=True)
     columns = build_columns(fit, mechanism, common_band(fit, mechanism))
-    assert NOISE[method](columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
+    assert estimate_noise(columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
 
 
 def test_a_tilt_of_the_base_turns_gravity():
@@ -262,10 +250,10 @@ def test_a_patch_changes_the_mjcf_and_nothing_else(tmp_path):
     np.testing.assert_allclose(chain.inertia[1, 1:], given.inertia[1, 1:], rtol=1e-5, atol=1e-7)
 
 
-def test_an_unknown_effect_is_refused(tmp_path, method):
+def test_an_unknown_effect_is_refused(tmp_path):
     logs(tmp_path)
     with pytest.raises(InputError, match="coulomb_friction"):
-        found_gap(tmp_path, method, effects=["bulk_modulus"])
+        found_gap(tmp_path, effects=["bulk_modulus"])
 
 
 def test_an_arm_driven_by_its_own_forces_follows_its_motion(tmp_path):

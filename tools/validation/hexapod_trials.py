@@ -42,7 +42,7 @@ def make(out: Path, places: Sequence[Place]) -> None:
             raise InputError(out, f"no data: {done.stderr[-2000:]}")
 
 
-def answer(places: Sequence[Place], method: str) -> None:
+def answer(places: Sequence[Place]) -> None:
     """Let a process that sees nothing but the model and copies of the logs answer all trials."""
     with tempfile.TemporaryDirectory(prefix="logs_") as folder:
         copies = []
@@ -55,8 +55,6 @@ def answer(places: Sequence[Place], method: str) -> None:
             str(MODEL / "palida.xml"),
             str(MODEL / "columns.yaml"),
             *map(str, copies),
-            "--method",
-            method,
         ]
         environment = {name: os.environ[name] for name in PASSED if name in os.environ}
         environment["PYTHONPATH"] = str(ROOT)
@@ -171,7 +169,6 @@ def main() -> int:
         parser.add_argument(f"--{kind}", type=int, help=f"number of {kind} trials")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--duration", type=float, default=12.0, help="of each run [s]")
-    parser.add_argument("--method", choices=("search", "regression"), default="search", help="of `hydrotele gap`")
     parser.add_argument("--score-only", action="store_true")
     args = parser.parse_args()
     try:
@@ -184,7 +181,7 @@ def main() -> int:
         left = [place for place in places if not place.result.is_file()]
         if left and not args.score_only:
             make(args.out.resolve(), left)
-            answer(left, args.method)
+            answer(left)
         print(score(args.out))
     except InputError as error:
         print(error, file=sys.stderr)

@@ -64,7 +64,7 @@ def judge(key: Document, result: Document) -> Verdict:
         The verdict. Right is: for one or two effects, that exactly as many are named as were
         planted and each planted one is among them, or in the ambiguous set of one of them; for a
         clean machine, that the answer is `no_gap`; for an effect outside the library, that the
-        answer is `unknown` and nothing is named with more than 50 %.
+        answer is `unknown` and nothing is named with more than 50 %, or that a force pulse is named as such.
     """
     planted = {_label(e): e for e in key["effects"]}
     sizes = [e["visibility"]["total_fit_runs"] for e in key["effects"]]
@@ -78,6 +78,7 @@ def judge(key: Document, result: Document) -> Verdict:
             right = verdict == "no_gap" and not named
         case "outside":
             right = verdict == "unknown" and all(e["probability"] <= SURE for e in named)
+            right |= _is_pulse(key["effects"], named)
         case _:
             right = verdict in ("named", "ambiguous") and len(named) == len(planted) == len(found)
     gap = answer.get("gap", {})
@@ -91,6 +92,13 @@ def judge(key: Document, result: Document) -> Verdict:
         before=gap.get("before"), after=gap.get("after"), floor=gap.get("noise_floor"),
         seconds=answer.get("seconds"), error=result["error"],
     )  # fmt: skip
+
+
+def _is_pulse(planted: list[Document], named: list[Document]) -> bool:
+    """Return whether a planted force pulse is named, in each run apart; only the regression has it in its library."""
+    places = {e["location"].rpartition(".")[0] for e in named if e["name"] == "force_pulse"}
+    is_alone = all(e["name"] == "force_pulse" for e in named)
+    return is_alone and places == {e["location"] for e in planted if e["name"] == "pulse"} and bool(places)
 
 
 def _label(effect: Document) -> str:
