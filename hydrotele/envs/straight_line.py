@@ -316,6 +316,16 @@ def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[
     return sample_start_positions(machine, rng, low, high)
 
 
+@compiled
+def compute_line_potential(f, e):
+    """Return the potential of the sum of the true errors, see `compute_tracking_potential`.
+
+    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE.
+    """
+    across, along, attitude = compute_true_line_errors(f, e)
+    return compute_tracking_potential(f, across + abs(along) + abs(attitude))
+
+
 STRAIGHT_LINE = Task(
     name="StraightLine",
     kind="line",
@@ -362,6 +372,5 @@ def run_task_part(part, m, d, number, argument, out):
     elif part == REWARD:
         return store_episode_end(e, compute_line_reward(f, e, w))
     elif part == POTENTIAL:
-        across, along, attitude = compute_true_line_errors(f, e)
-        return compute_tracking_potential(f, across + abs(along) + abs(attitude))
+        return compute_line_potential(f, e)
     return 0.0
