@@ -84,8 +84,8 @@ class ReducedCore(TaskCore):
         functions = make_step_functions(self.setup.task.kind)
         self._begin, channels = functions.begin, sensor_channels(self.setup.variants.plant)
         models = [reduced_model(machine, channels) for machine in machines]
-        starts, readings = make_start_states(self.setup, machines, models)
-        self._arrays = self._make_episode_arrays(machines, models, readings)
+        starts, *measured = make_start_states(self.setup, machines, models)
+        self._arrays = self._make_episode_arrays(machines, models, *measured)
         self.batch = Batch(
             machines, rows, period=self.setup.clock.period, timestep=options.timestep, threads=threads,
             task=BatchTask(functions.before, functions.after, self._arrays), channels=channels, start=starts,
@@ -97,7 +97,9 @@ class ReducedCore(TaskCore):
                      "measures", "final_measures"):  # fmt: skip
             setattr(self, name, getattr(self, name)[:count])
 
-    def _make_episode_arrays(self, machines: list[Machine], models: list[Model], readings: np.ndarray) -> EpisodeArrays:
+    def _make_episode_arrays(
+        self, machines: list[Machine], models: list[Model], readings: np.ndarray, commands: np.ndarray
+    ) -> EpisodeArrays:
         tables = {name: [getattr(m.mech if name in _MECHANISM else m, name) for m in models] for name in _VARIED}
         tips, link = [machine.arm.tip.position for machine in machines if machine.arm], ""
         if machines[0].arm:
@@ -108,7 +110,7 @@ class ReducedCore(TaskCore):
             high=self.observation_high, reward=self.reward, terminated=self.terminated, truncated=self.truncated,
             measures=self.measures, final_measures=self.final_measures,
             tip_frame=body_names(machines[0]).index(link), tip=np.resize(tips, (len(readings), 3)),
-            start_tip=self.setup.variants.start_tips, start_reading=readings,
+            start_tip=self.setup.variants.start_tips, start_reading=readings, start_command=commands,
             **{name: np.array(v[:1] if all(np.array_equal(v[0], x) for x in v) else v) for name, v in tables.items()},
         )  # fmt: skip
 
@@ -122,6 +124,8 @@ class ReducedCore(TaskCore):
         mask, variant = np.zeros(self.batch.count, bool), np.zeros(self.batch.count, np.int64)
         mask[numbers], variant[numbers] = True, self.episodes["variant"][numbers]
         self.batch.reset(mask, variant)
+        for row in range(self.batch.machines.history.shape[1]):
+            self.batch.machines.history[numbers, row] = self._arrays.start_command[variant[numbers]]
         for name in self._varied:
             self.batch.expand_parameters(name)[numbers] = getattr(self._arrays, name)[variant[numbers]]
 
@@ -152,26 +156,27 @@ class ReducedCore(TaskCore):
         """Do nothing: memory is freed with the object."""
 
 
-def make_start_states(setup: TaskSetup, machines: list[Machine], models: list[Model]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start states (v, n) of the reduced model at rest, and the true values (v, c) of its sensors.
+def make_start_states(
+    setup: TaskSetup, machines: list[Machine], models: list[Model]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the start states of the reduced model at rest, the true values of its sensors and its commands.
 
     Args:
         setup: the task with its options, whose variants have start states of MuJoCo.
         machines: one machine per variant, or one for all.
         models: their reduced models.
 
-    Raises:
-        InputError: a drive needs a command to hold the machine at rest.
+    Returns:
+        (states (v, n), readings (v, c), commands (v, nu) [1] or [V]).
     """
     plant, variants = setup.variants.plant, setup.variants
     data, names = mujoco.MjData(plant.model), coordinate_names(machines[0])
     states = np.zeros((len(variants.states), state_size(models[0])))
-    readings = np.zeros((len(states), len(models[0].kind)))
+    readings, commands = np.zeros((len(states), len(models[0].kind))), np.zeros((len(states), plant.model.nu))
     for v, state in enumerate(states):
         model = models[v % len(models)]
         mujoco.mj_setState(plant.model, data, variants.states[v], STATE_KIND)
-        if data.ctrl.any():
-            raise InputError("device", "the start of the task needs a command that holds the machine: leave out device")
+        commands[v] = data.ctrl
         positions = data.qpos - plant.model.opt.timestep * data.qvel if plant.model.nq == plant.model.nv else data.qpos
         n, space = len(model.mech.independent), model_space(model)
         for f, k in enumerate(model.mech.independent):
@@ -184,4 +189,4 @@ def make_start_states(setup: TaskSetup, machines: list[Machine], models: list[Mo
         place(model, space, state)
         set_activations(model, space, state)
         show_channels(model, space, state, 0, 1, 1.0, readings[:0], readings[v])
-    return states, readings
+    return states, readings, commands

@@ -63,6 +63,7 @@ class EpisodeArrays(NamedTuple):
         tip: (v, 3) position of the tip in the frame of its link [m].
         start_tip: (v, 3) position of the tip at the start [m].
         start_reading: (v, c) true values of the sensors at the start.
+        start_command: (v, nu) commands that hold the machine at the start [1] or [V].
         shape: (v or 1, ...) parameters of the variants, see `batch.PARAMETERS`; one row if they are equal.
         joint: likewise.
         gravity: likewise.
@@ -88,6 +89,7 @@ class EpisodeArrays(NamedTuple):
     tip: np.ndarray
     start_tip: np.ndarray
     start_reading: np.ndarray
+    start_command: np.ndarray
     shape: np.ndarray
     joint: np.ndarray
     gravity: np.ndarray
@@ -164,7 +166,7 @@ def begin_episode(task, i, reading):
     for c in range(len(reading)):
         reading[c] = task.start_reading[e.variant, c]
     for k in range(f.axes):
-        e.position[k] = reading[k]
+        e.position[k], e.command[k] = reading[k], task.start_command[e.variant, k]
     sample_sensors(f, e, reading)
     initialise_references(f, e)
     for c in range(task.measures.shape[1]):
@@ -225,9 +227,11 @@ def restart_episode(task, model, sp, z, machines, i):
     copy_variant_values(task.gain, variant, model.gain)
     copy_variant_values(task.delay, variant, model.delay)
     copy_variant_matrix(task.transmission, variant, model.transmission)
-    for k in range(machines.command.shape[1]):
-        machines.command[i, k] = 0.0
     restart_machine(model, sp, z, machines, i, variant)
+    for k in range(machines.command.shape[1]):
+        machines.command[i, k] = task.start_command[variant, k]
+        for row in range(machines.history.shape[1]):
+            machines.history[i, row, k] = task.start_command[variant, k]
 
 
 @compiled
