@@ -122,7 +122,7 @@ class Batch:
         models = [reduced_model(variant, self.channels) for variant in variants]
         _require_equal_structure(models, self.channels)
         self._single, self._task = models[0], task
-        self._model = _stack_models(models, count)
+        self._model: Any = _stack_models(models, count)
         self._timing = _make_timing(self._single, period, timestep, rate_limit)
         self._noise = _make_noise(self.machine, sensors, self.channels, period)
         start = options.get("start")
@@ -247,7 +247,7 @@ def _require_equal_structure(models: list[Model], channels: tuple[str, ...]) -> 
             raise InputError("batch", f"cannot simulate the delay of sensors {', '.join(late)}; omit these channels")
         for one, other in ((models[0], model), (models[0].mech, model.mech)):
             for name, value, second in zip(one._fields, one, other, strict=True):
-                if name not in (*PARAMETERS, "mech") and not np.array_equal(value, second):
+                if name not in (*PARAMETERS, "mech") and not np.array_equal(np.asarray(value), np.asarray(second)):
                     raise InputError("batch", f"variants of the machine must have the same {name}")
 
 

@@ -6,6 +6,7 @@ column by column, so that neighbouring threads read neighbouring numbers.
 """
 
 import functools
+import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,11 +14,14 @@ import numpy as np
 
 from hydrotele.batch import machine_step
 from hydrotele.batch.machine_step import Machines, Noise, Timing
-from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, trace_mechanism
+from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode, trace_mechanism
+from hydrotele.core.compiled import cache_folder, source_digest
 from hydrotele.core.device import import_cuda, make_device_function
+from hydrotele.core.output import atomic_file
 from hydrotele.core.tracing import make_device_program
 from hydrotele.estimate.reduced_model import Model
-from hydrotele.terms.table import make_law_functions
+from hydrotele.terms.law import LAWS
+from hydrotele.terms.table import law_index, make_law_functions
 from hydrotele.terms.term import Term
 
 THREADS_PER_BLOCK = 64
@@ -58,8 +62,35 @@ def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Te
     ]
     head = ["def kernel(model, machines, noise, timing, task, periods, source):", "    i = cuda.grid(1)"]
     head += ["    if i < machines.state.shape[0]:"]
-    exec("\n".join(head + [f"        {line}" for line in body]), scope)  # local arrays have constant sizes
-    return cuda.jit(scope["kernel"]), code.parameters
+    text = "\n".join([*head, *(f"        {line}" for line in body), ""])  # local arrays have constant sizes
+    path = _store_source(text, code, task, terms)
+    exec(compile(text, path or "<kernel of a batch>", "exec"), scope)
+    return cuda.jit(scope["kernel"], cache=path is not None), code.parameters
+
+
+def _store_source(text: str, code: MechanismCode, task: Any, terms: Sequence[Term]) -> str | None:
+    """Write the source of a kernel to the cache folder and return its path; numba-cuda stores the code next to it.
+
+    The name of the folder depends on all that the code depends on. Returns None, for no cache, with laws or tasks
+    of other packages or without a cache folder.
+    """
+    modules = [__name__, *(f.py_func.__module__ for f in (task.before, task.after))]
+    modules += [LAWS[term.law].function.__module__ for term in terms]
+    folder = cache_folder()
+    if folder is None or any(module.partition(".")[0] != "hydrotele" for module in modules):
+        return None
+    parts = [text, *map(source_digest, modules), *(getattr(code, name).digest for name in PROGRAMS)]
+    parts += [f.py_func.__qualname__ for f in (task.before, task.after)] + [repr([term.law for term in terms])]
+    parts += [str([law_index(term.law) for term in terms])]
+    path = folder / f"cuda_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}" / "kernel.py"
+    try:
+        path.parent.mkdir(mode=0o700, exist_ok=True)
+        if not path.exists():
+            with atomic_file(path, ".py") as part:
+                part.write_text(text)
+    except OSError:
+        return None
+    return str(path)
 
 
 def _local_array(name: str, values: np.ndarray) -> list[str]:

@@ -1,11 +1,13 @@
 """Speed, memory and repeatability of batches, for `hydrotele bench --device` and the page of the batch."""
 
+import json
 import time
 from typing import Any
 
 import numpy as np
 
 from hydrotele.batch.batch import Batch
+from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 
 CPU_COUNTS, CUDA_COUNTS = (256, 4096), (256, 4096, 16384, 65536, 262144)
@@ -79,3 +81,29 @@ def measure_parity(machine: Machine, seconds: float, count: int = 64) -> dict[st
         "pressure": float(gap[np.char.startswith(names, "pressure")].max(initial=0.0)),
         "repeated": float(np.array_equal(states[1], states[2])),
     }
+
+
+def compare_with_log(machine: Machine, log: Log) -> dict[str, tuple[float, float]]:
+    """Simulate the commands of a log with a batch of one machine and compare the channels.
+
+    Args:
+        machine: the machine.
+        log: log of a run that started at rest, with its true values and one row per control period.
+
+    Returns:
+        Channel -> (RMS, largest) difference [channel's unit].
+    """
+    begun, rest = json.loads(log.metadata["initial_state"]), Batch(machine, 1)
+    state, names = rest.state.copy(), rest.state_names
+    for i, axis in enumerate(begun["order"]):
+        state[0, names.index(f"position.{axis}")] = begun["angle"][i]
+        for side in ("pressure_head", "pressure_rod"):
+            state[0, names.index(f"{side}.{axis}")] = begun[side][i]
+    batch = Batch(machine, 1, start=state)
+    commands = np.column_stack([log[f"command.{axis}"] for axis in batch.axes])
+    shown = np.array([batch.step(command)[0].copy() for command in commands[:-1]])
+    found = {}
+    for c, channel in enumerate(batch.channels):
+        error = shown[:, c] - log[channel][1:]
+        found[channel] = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
+    return found

@@ -98,9 +98,9 @@ class _Tracer:
     def _make_traceable(self, function: Any) -> Any:
         return make_traceable_function(function, self._functions)
 
-    def _begin(self) -> tuple[Program, Any, Space, dict[str, np.ndarray]]:
+    def _begin(self) -> tuple[Program, Any, Space, dict[str, Any]]:
         """Return a new program with its model, work space and arrays of loaded values."""
-        sizes = [int(np.prod(self.shapes[name])) if name in self.shapes else 0 for name in ARRAYS]
+        sizes = [max(1, int(np.prod(self.shapes[name]))) if name in self.shapes else 0 for name in ARRAYS]
         program, mech = Program(sizes), self.model.mech
         loaded = {name: symbolic_array(program, k, self.shapes[name]) for k, name in enumerate(ARRAYS) if sizes[k]}
         space = model_space(self.model)

@@ -87,7 +87,7 @@ def run_batch_benchmarks(device: str, machine: str, tool: str | None, quick: boo
         "first_step_s": "first step [s]", "bytes_per_machine": "bytes per machine", "failed": "not finite",
     }  # fmt: skip
     shown = [name for name in names if name in figures[0]]
-    table = make_table(*(names[name] for name in shown))
+    table = make_table(f"{machine} on {device}", *(names[name] for name in shown))
     for row in figures:
         table.add_row(*(f"{row[name]:,}" for name in shown))
     stdout_console.print(table)

@@ -340,8 +340,11 @@ def make_device_program(program: Program, arrays: Sequence[str]) -> Any:
     return make_program_function(program, 1, cuda.jit(device=True), extending.intrinsic)
 
 
+run: Any = None  # the copies of the next function have an intrinsic of this name
+
+
 def _call_run(arrays):
-    run(arrays)  # noqa: F821 - a global variable of the copies of this function
+    run(arrays)
 
 
 def symbolic_array(program: Program, array: int, shape: tuple[int, ...]) -> np.ndarray:

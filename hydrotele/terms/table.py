@@ -140,14 +140,19 @@ def law_arguments(law: Law) -> str:
 
 
 def make_law_functions(terms: Sequence[Term], wrap: Callable[[Any], Any]) -> dict[Any, Any]:
-    """Return forms of `find_law` and `call_law` for processors without function addresses.
+    """Return forms of functions of this module for processors without function addresses.
 
-    They select the laws of some terms by their index in this process's table of laws.
+    `find_law` and `call_law` then select the laws of some terms by their index in this process's table of laws.
+    Without terms all sums of terms are 0, which saves most of the compile time.
 
     Args:
         terms: terms of a machine.
         wrap: compiles a Python function for the processor; it may refer to compiled functions of this package.
     """
+    if not terms:
+        sums = {sum_terms: 0.0, sum_terms_with_slope: (0.0, 0.0), sum_flow_terms: (0.0, 0.0, 0.0, 0.0)}
+        functions = {function: wrap(_make_constant_function(value)) for function, value in sums.items()}
+        return functions | {has_term: wrap(lambda terms, balance, axis: False)}
     lines, scope = ["def call_law(law, terms, at, s):", "    p = terms[at:]"], {}
     for name in dict.fromkeys(term.law for term in terms):
         index = law_index(name)
@@ -156,6 +161,13 @@ def make_law_functions(terms: Sequence[Term], wrap: Callable[[Any], Any]) -> dic
     text = "\n".join([*lines, "    return 0.0", f"def find_law(terms, at):\n    return 1 + int(terms[at + {_LAW}])\n"])
     exec(text, scope)  # generated code, because the number of laws and arguments differs
     return {find_law: wrap(scope["find_law"]), call_law: wrap(scope["call_law"])}
+
+
+def _make_constant_function(value: Any) -> Any:
+    """Return a function with the arguments of `sum_terms`, or of `sum_flow_terms`, that returns a constant."""
+    if isinstance(value, tuple) and len(value) == 4:
+        return lambda terms, axis, s, drives: value
+    return lambda terms, balance, axis, s, drives: value
 
 
 def _compile_uncached(function):
