@@ -81,7 +81,8 @@ def update_sensors(f, e, sim):
     for i in range(k):
         e.position[i] = values[i]
     apply_sensor_delays(sim.sensor_history, e.tick * f.substeps, values)
-    sample_sensors(f, e, values)
+    scale = float64_view(f.scales + 8 * e.variant * MAX_CHANNELS, c)
+    sample_sensors(f, e, values, scale, float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c))
 
 
 _WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
@@ -206,8 +207,9 @@ def _run_environment_step(f, e, w, action):
     step of the episode's duration.
     """
     sim = _make_simulation_record(f, e, w)
+    table = float64_view(f.table, f.axes * TABLE_POINTS * 3).reshape((f.axes, TABLE_POINTS, 3))
     for _ in range(f.ticks):
-        convert_action_to_commands(f, e, action)
+        convert_action_to_commands(f, e, action, table)
         compute_servo_commands(f, e)
         step_physics(sim, e.tick, f.substeps, e.command[: f.axes])
         e.tick += 1

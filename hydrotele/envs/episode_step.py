@@ -5,11 +5,12 @@ joint servo tracks the references. The acceleration of the references is limited
 20 t cannot follow a step.
 """
 
+import math
+
 import numpy as np
 
 from hydrotele.control.rate_references import ArmLimits, advance_joint_reference, advance_pose_reference
 from hydrotele.control.servo import (
-    TABLE_POINTS,
     ComputedForce,
     DriveReference,
     MeasuredState,
@@ -17,7 +18,6 @@ from hydrotele.control.servo import (
     servo_step,
 )
 from hydrotele.core.compiled import compiled
-from hydrotele.core.memory import float64_view
 from hydrotele.envs.episode import (
     JOINT_RATE,
     MAX_ARM_AXES,
@@ -57,8 +57,12 @@ def _integrate_pose_rates(f, e, action):
     k, goal = f.arm_axes, np.zeros(MAX_ARM_AXES)
     for c in range(k):
         goal[c] = _clip_action(f, action, c) * f.fastest_pose[c]
-    ranges = np.empty((k, 2))
-    q, rates, joint = arm_values(f, e.reference), arm_values(f, e.reference_rate), arm_values(f, e.joint)
+    ranges = np.empty(2 * k).reshape((k, 2))
+    q, rates, joint = (
+        arm_values(f, e.reference, np.empty(f.arm_axes)),
+        arm_values(f, e.reference_rate, np.empty(f.arm_axes)),
+        arm_values(f, e.joint, np.empty(f.arm_axes)),
+    )
     for a in range(k):
         ranges[a, 0], ranges[a, 1] = f.ranges[f.driven_axis[a], 0], f.ranges[f.driven_axis[a], 1]
     arm = ArmLimits(f.arm, ranges, f.accelerations)
@@ -68,7 +72,7 @@ def _integrate_pose_rates(f, e, action):
 
 
 @compiled
-def convert_action_to_commands(f, e, action):
+def convert_action_to_commands(f, e, action, table):
     """Convert the action into valve commands, or into references of the joint servo, for one control period.
 
     Args:
@@ -76,6 +80,7 @@ def convert_action_to_commands(f, e, action):
         e: record of EPISODE_STATE; `command` is written for valve actions. For all others, joint
             and pose references and `drive`, the references of the drives, are written.
         action: (actions,) of the agent; values outside +-1 are clipped.
+        table: (axes, TABLE_POINTS, 3) of `servo.tabulate_drive_geometry`.
 
     Returns:
         Nothing.
@@ -93,7 +98,6 @@ def convert_action_to_commands(f, e, action):
     elif f.mode == JOINT_RATE:
         _integrate_joint_rates(f, e, action, 0)
     k = f.axes
-    table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
     interpolate_drive_reference(
         f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
         e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
@@ -123,7 +127,7 @@ def compute_servo_commands(f, e):
 
 
 @compiled
-def sample_sensors(f, e, values):
+def sample_sensors(f, e, values, scale, offset):
     """Convert true values into readings with random errors, and store them in the episode.
 
     Args:
@@ -131,6 +135,8 @@ def sample_sensors(f, e, values):
         e: record of EPISODE_STATE; measured values, their random errors and `sampled_reference` are written.
         values: (c,) true values after delay and lag: positions, head and rod pressure of every valve, supply
             pressures [rad] or [m], [Pa]; replaced by the readings.
+        scale: (c,) scale factors of the sensors [1].
+        offset: (c,) offsets of the sensors.
 
     Returns:
         Nothing.
@@ -142,10 +148,7 @@ def sample_sensors(f, e, values):
         e.sampled_reference[i] = e.reference[i]
     for i in range(c):
         e.error[i] = f.accuracy[i] * (2.0 * draw_uniform(e) - 1.0) if f.noisy else 0.0
-    sensors = SensorParameters(
-        float64_view(f.scales + 8 * e.variant * MAX_CHANNELS, c),
-        float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c), f.converters[0], f.converters[1], f.converters[2],
-    )  # fmt: skip
+    sensors = SensorParameters(scale, offset, f.converters[0], f.converters[1], f.converters[2])
     convert_to_readings(sensors, values, e.error[:c])
     span = f.every * f.period if e.tick > 0 else 0.0
     readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
@@ -179,7 +182,7 @@ def initialise_references(f, e):
     for c in range(len(e.pose_rate)):
         e.pose_rate[c] = 0.0
     if f.arm_axes > 0:
-        compute_tip_pose(f.arm, arm_values(f, e.reference), e.pose)
+        compute_tip_pose(f.arm, arm_values(f, e.reference, np.empty(f.arm_axes)), e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
 
@@ -212,4 +215,4 @@ def clip_observation(e, out, low, high):
     for c in range(len(out)):
         if not low[c] <= out[c] <= high[c]:
             e.saturated += 1
-            out[c] = min(high[c], max(low[c], out[c])) if np.isfinite(out[c]) else low[c]
+            out[c] = min(high[c], max(low[c], out[c])) if math.isfinite(out[c]) else low[c]

@@ -111,6 +111,8 @@ class ReducedCore(TaskCore):
             measures=self.measures, final_measures=self.final_measures,
             tip_frame=body_names(machines[0]).index(link), tip=np.resize(tips, (len(readings), 3)),
             start_tip=self.setup.variants.start_tips, start_reading=readings, start_command=commands,
+            scale=self.setup.variants.sensor_scales, offset=self.setup.variants.sensor_offsets,
+            table=np.ascontiguousarray(self.setup.drive_table),
             **{name: np.array(v[:1] if all(np.array_equal(v[0], x) for x in v) else v) for name, v in tables.items()},
         )  # fmt: skip
 

@@ -63,6 +63,9 @@ class EpisodeArrays(NamedTuple):
         tip: (v, 3) position of the tip in the frame of its link [m].
         start_tip: (v, 3) position of the tip at the start [m].
         start_reading: (v, c) true values of the sensors at the start.
+        scale: (v, MAX_CHANNELS) scale factors of the sensors [1].
+        offset: (v, MAX_CHANNELS) offsets of the sensors.
+        table: (nu, TABLE_POINTS, 3) of `servo.tabulate_drive_geometry`.
         start_command: (v, nu) commands that hold the machine at the start [1] or [V].
         shape: (v or 1, ...) parameters of the variants, see `batch.PARAMETERS`; one row if they are equal.
         joint: likewise.
@@ -89,6 +92,9 @@ class EpisodeArrays(NamedTuple):
     tip: np.ndarray
     start_tip: np.ndarray
     start_reading: np.ndarray
+    scale: np.ndarray
+    offset: np.ndarray
+    table: np.ndarray
     start_command: np.ndarray
     shape: np.ndarray
     joint: np.ndarray
@@ -167,7 +173,7 @@ def begin_episode(task, i, reading):
         reading[c] = task.start_reading[e.variant, c]
     for k in range(f.axes):
         e.position[k], e.command[k] = reading[k], task.start_command[e.variant, k]
-    sample_sensors(f, e, reading)
+    sample_sensors(f, e, reading, task.scale[e.variant], task.offset[e.variant])
     initialise_references(f, e)
     for c in range(task.measures.shape[1]):
         task.measures[i, c] = 0.0
@@ -185,19 +191,26 @@ def write_observation(task, i, out):
 
 
 @compiled
-def begin_episodes(task, machines, chosen):
-    """Begin new episodes and write their observations; the machines themselves are not changed.
+def begin_chosen_episode(task, machines, chosen, n):
+    """Begin episode `chosen[n]` and write its observation; its machine is not changed.
 
     Args:
         task: EpisodeArrays.
-        machines: Machines.
+        machines: Machines, whose readings are written.
         chosen: (k,) indices of the episodes.
+        n: from 0 to k - 1.
     """
+    i = chosen[n]
+    begin_episode(task, i, machines.reading[i])
+    task.reward[i], task.terminated[i], task.truncated[i] = 0.0, 0, 0
+    write_observation(task, i, task.observation[i])
+
+
+@compiled
+def begin_episodes(task, machines, chosen):
+    """Call `begin_chosen_episode` for all chosen episodes."""
     for n in range(len(chosen)):
-        i = chosen[n]
-        begin_episode(task, i, machines.reading[i])
-        task.reward[i], task.terminated[i], task.truncated[i] = 0.0, 0, 0
-        write_observation(task, i, task.observation[i])
+        begin_chosen_episode(task, machines, chosen, n)
 
 
 @compiled
@@ -240,7 +253,7 @@ def command_machine(task, model, sp, z, machines, i):
     f, e = task.parameters[0], task.episodes[i]
     if e.over != 0 or machines.failed[i] != 0:
         return
-    convert_action_to_commands(f, e, task.action[i])
+    convert_action_to_commands(f, e, task.action[i], task.table)
     compute_servo_commands(f, e)
     for k in range(machines.command.shape[1]):
         machines.command[i, k] = e.command[k]
@@ -288,7 +301,7 @@ def finish_period(task, model, sp, z, machines, i):
         for k in range(f.axes):
             e.position[k] = machines.reading[i, k]
         if e.tick % f.every == 0 and machines.failed[i] == 0:
-            sample_sensors(f, e, machines.reading[i])
+            sample_sensors(f, e, machines.reading[i], task.scale[e.variant], task.offset[e.variant])
     if not last:
         return
     if was_over:
@@ -314,11 +327,13 @@ class StepFunctions(NamedTuple):
         before: `command_machine`.
         after: `finish_period`.
         begin: `begin_episodes`.
+        begin_one: `begin_chosen_episode`.
     """
 
     before: Any
     after: Any
     begin: Any
+    begin_one: Any
 
 
 def make_step_functions(kind: str) -> StepFunctions:
@@ -330,7 +345,5 @@ def make_step_functions(kind: str) -> StepFunctions:
         function.__qualname__ += f"_{kind}"
         return compiled(function)
 
-    made = [
-        rebuild_function(f, wrap, swapped, copy_all=False) for f in (command_machine, finish_period, begin_episodes)
-    ]
-    return StepFunctions(*made)
+    functions = command_machine, finish_period, begin_episodes, begin_chosen_episode
+    return StepFunctions(*(rebuild_function(function, wrap, swapped, copy_all=False) for function in functions))

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import hydrotele.envs
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.variants import typical_variation
 from tools.studies.study import options, publish
