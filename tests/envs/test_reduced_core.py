@@ -52,9 +52,11 @@ def test_episodes_equal_those_on_mujoco(task, options, reward_tolerance):
         assert np.abs(core.episodes["tip"] - other.episodes["tip"]).max() < 1e-3
         assert np.array_equal(core.episodes["variant"], other.episodes["variant"])
     assert np.array_equal(core.episodes["goal"], other.episodes["goal"])
+    # the bucket oscillates by 0.1 mrad under its servo, and the models differ in the phase of this oscillation
+    pressure = 28e6 * (5e-3 if task == "StraightLine" else 1e-3)
     rms = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
     for field, value in zip(core.setup.fields, rms, strict=True):
-        limit = 1e-3 * 28e6 if field.unit == "Pa" else 0.02 if field.name.startswith("rate") else 1e-3
+        limit = pressure if field.unit == "Pa" else 0.02 if field.name.startswith("rate") else 1e-3
         assert value < limit, (field.name, value)
 
 
