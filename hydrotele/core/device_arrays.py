@@ -18,14 +18,14 @@ def make_local_array_functions() -> dict[str, Any]:
     cuda, real = import_cuda(), np.float64
     local, size = cuda.local, LOCAL_SIZE
 
-    def empty(count):
+    def make_empty_array(count):
         return local.array(size, real)[:count]
 
-    def zeros(count):
+    def make_zero_array(count):
         values = local.array(size, real)
         for k in range(size):
             values[k] = 0.0
         return values[:count]
 
-    inlined = {"inline": "always"}
-    return {function.__name__: cuda.jit(function, device=True, **inlined) for function in (empty, zeros)}
+    forms = {"empty": make_empty_array, "zeros": make_zero_array}
+    return {name: cuda.jit(function, device=True, inline="always") for name, function in forms.items()}

@@ -40,7 +40,7 @@ assert set(_VARIED) | set(_SENSOR_PARAMETERS) == set(PARAMETERS)
 def check_task(task: Task, setup: TaskSetup) -> None:
     """Raise InputError if a task or its options need what the reduced model does not have."""
     if task.kind not in TASK_FUNCTIONS or task.code or task.program is not None:
-        message = "needs MuJoCo for contact, or has code of its own: leave out device. The reduced model runs"
+        message = "needs MuJoCo for contact or other code: leave out device. The reduced model runs"
         message += " TrackTrajectory, StraightLine and ReachFeller"
         raise InputError(f"task {task.name}", message)
     variants = setup.variants

@@ -91,8 +91,7 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
     """
     found, choices = find_task(task), dict(choices)
     if (device := choices.pop("device", None)) not in (None, "cpu"):
-        message = f"must be cpu or cuda, not {device!r}; cuda is a device of make_vec"
-        raise InputError("environment option 'device'", message)
+        raise InputError("environment option 'device'", f"must be cpu, for the reduced model, not {device!r}")
     known = {field.name for field in dataclasses.fields(Options)}
     if strange := set(choices) - known:
         name = sorted(strange)[0]

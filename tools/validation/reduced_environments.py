@@ -22,8 +22,8 @@ TASKS: dict[str, dict[str, Any]] = {
 
 
 def make_environments(task: str, count: int, device: str | None, **more: Any) -> Any:
-    chosen = {**TASKS[task], **more} | ({} if device is None else {"device": device})
-    return gymnasium.make_vec(f"hydrotele/{task}-v0", count, "vector_entry_point", **chosen)
+    chosen: dict[str, Any] = {**TASKS[task], **more, "device": device}
+    return gymnasium.make_vec(f"hydrotele/{task}-v0", count, **chosen)
 
 
 def measure_speed(task: str, count: int, device: str | None, seconds: float) -> float:
