@@ -286,7 +286,7 @@ def _make_noise(machine: Machine, sensors: SensorSet | None, channels: tuple[str
 
 def _make_machines(models: list[Model], start: np.ndarray, count: int, timing: Timing, seed: int) -> Machines:
     """Allocate the state of all machines; machine i has start state i modulo their number."""
-    model, channels, drives = models[0], len(models[0].kind), len(models[0].gear)
+    channels, drives = len(models[0].kind), len(models[0].gear)
     linkage = []
     for k, state in enumerate(start):
         own = models[k % len(models)]
@@ -295,7 +295,8 @@ def _make_machines(models: list[Model], start: np.ndarray, count: int, timing: T
         linkage.append(np.zeros(sp.motion.joint.shape[1] + len(own.mech.dependent) * sp.motion.basis.shape[1]))
         store_linkage(own.mech.dependent, sp.motion.joint, sp.motion.basis, linkage[-1])
     rows, places = np.array(linkage), np.arange(count) % len(start)
-    history = 1 + int(np.ceil(model.delay.max(initial=0.0) / timing.period - 1e-9))
+    delay = max(own.delay.max(initial=0.0) for own in models)
+    history = 1 + int(np.ceil(delay / timing.period - 1e-9))
     return Machines(
         state=start[places], linkage=rows[places], history=np.zeros((count, history, drives)),
         command=np.zeros((count, drives)), reading=np.zeros((count, channels)), error=np.zeros((count, channels)),

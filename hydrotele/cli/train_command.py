@@ -37,6 +37,7 @@ class TrainOptions(NamedTuple):
     settings: list[str]
     shaping: bool
     curriculum: bool
+    device: str | None
     episodes: int
     resume: bool
     video: bool
@@ -136,7 +137,7 @@ def _make_state(options: TrainOptions) -> Any:
     plan = TrainingPlan(
         task=name, options=parse_environment_options(options.settings), minutes=minutes, steps=options.steps,
         seed=options.seed, num_envs=options.envs, threads=options.threads, shaping=options.shaping,
-        curriculum=options.curriculum,
+        curriculum=options.curriculum, device=options.device,
     )  # fmt: skip
     return TrainingState(complete_plan(plan)), folder
 

@@ -21,7 +21,8 @@ the policy; --resume continues it.
 \b
 Options of the environment (--set) are those of gymnasium.make: action, sensors, control_rate,
 duration, effects, randomise, variants, ... --no-shaping leaves the reward as it is. Without
---no-curriculum, the goals grow during the first 40 % of the training.
+--no-curriculum, the goals grow during the first 40 % of the training. --device cpu trains on the reduced
+model, which has no contact and is faster; the policy is always evaluated on MuJoCo.
 """
 
 RECORD_EPILOG = """\b
@@ -60,6 +61,7 @@ def train(
     set_: SetOption = None,
     shaping: Annotated[bool, typer.Option(help="Add the potential-based term to the reward.")] = True,
     curriculum: Annotated[bool, typer.Option(help="Let the goals grow from 0.2 of their size.")] = True,
+    device: Annotated[Literal["cpu"] | None, typer.Option(help="Train on the reduced model instead of MuJoCo.")] = None,
     episodes: Annotated[int, typer.Option(min=2, max=4096, help="Episodes of the final comparison.")] = 64,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the output folder.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Write an episode as episode.mp4.")] = False,
@@ -69,7 +71,8 @@ def train(
     from hydrotele.cli.train_command import TrainOptions, train_to_folder
 
     train_to_folder(TrainOptions(
-        task, out, minutes, steps, seed, envs, threads, set_ or [], shaping, curriculum, episodes, resume, video, json,
+        task, out, minutes, steps, seed, envs, threads, set_ or [], shaping, curriculum, device, episodes, resume,
+        video, json,
     ))  # fmt: skip
 
 

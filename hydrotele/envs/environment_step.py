@@ -1,9 +1,6 @@
 """Environment step in native code: actions, control, sensors, reward and reset.
 
 MuJoCo calls `step_or_reset_simulation` for every simulation from its own threads, without the Python interpreter.
-Joint-rate actions move the joint references; pose-rate actions move them by resolved motion. The
-joint servo tracks the references. The acceleration of the references is limited, since a machine of
-20 t cannot follow a step.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -12,31 +9,26 @@ import mujoco
 import numpy as np
 from numba import carray, types
 
-from hydrotele.control.control_loop import Controller, TickReference, control_tick
-from hydrotele.control.rate_references import ArmLimits, advance_joint_reference, advance_pose_reference
-from hydrotele.control.servo import (
-    TABLE_POINTS,
-    ComputedForce,
-    DriveReference,
-    MeasuredState,
-    interpolate_drive_reference,
-)
+from hydrotele.control.servo import TABLE_POINTS, interpolate_drive_reference
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.memory import address_to_pointer, copy_values, float64_view
 from hydrotele.envs.episode import (
     DISABLED,
-    JOINT_RATE,
-    MAX_ARM_AXES,
     MAX_AXES,
     MAX_CHANNELS,
     MAX_MEASURES,
     NEXT_STEP,
     RESET,
-    RESOLVED_MOTION,
     SAME_STEP,
-    VALVE,
-    arm_values,
-    draw_uniform,
+)
+from hydrotele.envs.episode_step import (
+    clip_observation,
+    compute_servo_commands,
+    convert_action_to_commands,
+    draw_variant,
+    initialise_references,
+    sample_sensors,
+    shape_reward,
 )
 from hydrotele.envs.observation import write_machine_observation
 from hydrotele.envs.task_interface import (
@@ -51,84 +43,17 @@ from hydrotele.envs.task_interface import (
     task_parameters_view,
 )
 from hydrotele.hydraulics.actuator_layout import SLOT_COUNT
-from hydrotele.kinematics.task_space import compute_tip_pose
 from hydrotele.simulate.batch import STATE_KIND
 from hydrotele.simulate.mujoco_c_api import call_mj_set_state
-from hydrotele.simulate.sensor_models import Readings, SensorParameters, convert_to_readings, store_readings
 from hydrotele.simulate.stepping import (
     CommandDelayLine,
     SensorHistory,
     Simulation,
     apply_sensor_delays,
     initialise_history,
+    step_physics,
     true_sensor_values,
 )
-
-
-@compiled
-def _clip_action(f, action, a):
-    """Return element `a` of the action clipped to +-1, or 0 if the task locks this action."""
-    return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
-
-
-@compiled
-def _integrate_joint_rates(f, e, action, first):
-    """Integrate rate actions, from index `first` on, over one control period to the joint references of the servo."""
-    for a in range(first, f.actions):
-        i = f.driven_axis[a]
-        goal = _clip_action(f, action, a) * f.fastest[i]
-        e.reference[i], e.reference_rate[i] = advance_joint_reference(
-            e.reference[i], e.reference_rate[i], goal, e.joint[i], f.ranges[i], f.acceleration, f.period
-        )
-
-
-@compiled
-def _integrate_pose_rates(f, e, action):
-    """Integrate tip rate actions over one control period, and convert the tip pose to joint references."""
-    k, goal = f.arm_axes, np.zeros(MAX_ARM_AXES)
-    for c in range(k):
-        goal[c] = _clip_action(f, action, c) * f.fastest_pose[c]
-    ranges = np.empty((k, 2))
-    q, rates, joint = arm_values(f, e.reference), arm_values(f, e.reference_rate), arm_values(f, e.joint)
-    for a in range(k):
-        ranges[a, 0], ranges[a, 1] = f.ranges[f.driven_axis[a], 0], f.ranges[f.driven_axis[a], 1]
-    arm = ArmLimits(f.arm, ranges, f.accelerations)
-    e.blocked = 1 if advance_pose_reference(arm, goal, f.period, joint, e.pose, e.pose_rate, q, rates) else 0
-    for a in range(k):
-        e.reference[f.driven_axis[a]], e.reference_rate[f.driven_axis[a]] = q[a], rates[a]
-
-
-@compiled
-def convert_action_to_commands(f, e, action):
-    """Convert the action into valve commands, or into references of the joint servo, for one control period.
-
-    Args:
-        f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `command` is written for valve actions. For all others, joint
-            and pose references and `drive`, the references of the drives, are written.
-        action: (actions,) of the agent; values outside +-1 are clipped.
-
-    Returns:
-        Nothing.
-
-    Source: `control.resolved_motion`, `control.servo`.
-    """
-    if f.mode == VALVE:
-        for a in range(f.actions):
-            i = f.driven_axis[a]
-            e.command[i] = _clip_action(f, action, a) * f.limit[i]
-        return
-    if f.mode == RESOLVED_MOTION:
-        _integrate_pose_rates(f, e, action)
-        _integrate_joint_rates(f, e, action, f.arm_axes)
-    elif f.mode == JOINT_RATE:
-        _integrate_joint_rates(f, e, action, 0)
-    k = f.axes
-    table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
-    interpolate_drive_reference(
-        f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
-        e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
-    )  # fmt: skip
 
 
 @compiled
@@ -151,25 +76,13 @@ def update_sensors(f, e, sim):
         for i in range(k):
             e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
         return
-    values, scales = np.empty(c), f.scales + 8 * e.variant * MAX_CHANNELS
+    values = np.empty(c)
     true_sensor_values(sim, values)
     for i in range(k):
         e.position[i] = values[i]
-        e.sampled_reference[i] = e.reference[i]
     apply_sensor_delays(sim.sensor_history, e.tick * f.substeps, values)
-    for i in range(c):
-        e.error[i] = f.accuracy[i] * (2.0 * draw_uniform(e) - 1.0) if f.noisy else 0.0
-    sensors = SensorParameters(
-        float64_view(scales, c), float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c), f.converters[0],
-        f.converters[1], f.converters[2],
-    )  # fmt: skip
-    convert_to_readings(sensors, values, e.error[:c])
-    span = f.every * f.period if e.tick > 0 else 0.0
-    readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
-    store_readings(values, f.hydraulic, span, readings)
-
-
-assert MAX_CHANNELS >= 4 * MAX_AXES
+    scale = float64_view(f.scales + 8 * e.variant * MAX_CHANNELS, c)
+    sample_sensors(f, e, values, scale, float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c))
 
 
 _WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
@@ -203,19 +116,6 @@ def _make_simulation_record(f, e, w):
         f.mj_step, w.model, w.data, w.qpos, w.qvel, w.act, w.ctrl, f.timestep, f.axes, f.hydraulic,
         f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandDelayLine(ring, delays), past,
     )  # fmt: skip
-
-
-@compiled
-def _run_control_period(f, e, sim):
-    """Run the joint servo once and then the physics steps of one control period."""
-    k, none = f.axes, np.zeros(f.axes)
-    controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
-    drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
-    reference = TickReference(
-        e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
-    )  # fmt: skip
-    measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
-    control_tick(sim, e.tick, f.substeps, controller, reference, measured)
 
 
 @compiled
@@ -256,25 +156,12 @@ def _compute_potential(f, w):
 
 
 @compiled
-def _shape_reward(f, e, reward, potential):
-    """Add the potential-based shaping F = gamma Phi(s') - Phi(s) to the reward of a step from s to s'; store Phi(s').
-
-    Source: Ng, Harada, Russell 1999, Policy invariance under reward transformations, theorem 1. Phi
-    is 0 in a terminal state.
-    """
-    reward += f.shaping * potential - e.potential
-    e.potential = potential
-    return reward
-
-
-@compiled
 def _begin_episode(f, e, w):
     """Draw a variant, set the simulation to its start state, and let the task draw a new goal.
 
     Model parameters, sensors, references and counters of the episode are initialised.
     """
-    e.last_variant, e.last_fault = e.variant, e.fault
-    e.variant = int(draw_uniform(e) * f.variants)
+    draw_variant(f, e)
     start = f.starts + 8 * e.variant * f.states
     call_mj_set_state(f.mj_set_state, w.model, w.data, start, STATE_KIND)
     places = carray(address_to_pointer(f.places), (3 * f.fields,), np.int64)
@@ -284,24 +171,14 @@ def _begin_episode(f, e, w):
         taken = float64_view(places[3 * n + 1] + 8 * w.index * size, size)
         for c in range(size):
             taken[c] = given[c]
-    e.episode += 1
-    e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
-    e.command[:] = 0.0
-    e.work = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
     sim = _make_simulation_record(f, e, w)
     initialise_history(sim, w.ctrl)
     tips = float64_view(f.start_tips + 24 * e.variant, 3)
     copy_values(e.tip, tips)
-    e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
     update_sensors(f, e, sim)
-    for i in range(len(e.joint)):
-        e.reference[i] = e.sampled_reference[i] = e.joint[i]
-    if f.arm_axes > 0:
-        compute_tip_pose(f.arm, arm_values(f, e.reference), e.pose)
-    for i in range(f.hydraulic):
-        e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
+    initialise_references(f, e)
     w.measures[:] = 0.0
     call_task_part(f, w, BEGIN, 0)
     e.potential = _compute_potential(f, w)
@@ -316,14 +193,10 @@ def _write_observation(f, e, w, address):
     """
     n = f.observations
     out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
-    low = carray(address_to_pointer(f.low), (n,), np.float32)
-    high = carray(address_to_pointer(f.high), (n,), np.float32)
     at = write_machine_observation(f, e, out)
     call_task_part(f, w, OBSERVE, address + 4 * (w.index * n + at))
-    for c in range(n):
-        if not low[c] <= out[c] <= high[c]:
-            e.saturated += 1
-            out[c] = min(high[c], max(low[c], out[c])) if np.isfinite(out[c]) else low[c]
+    clip_observation(e, out, carray(address_to_pointer(f.low), (n,), np.float32),
+                     carray(address_to_pointer(f.high), (n,), np.float32))  # fmt: skip
 
 
 @compiled
@@ -334,9 +207,11 @@ def _run_environment_step(f, e, w, action):
     step of the episode's duration.
     """
     sim = _make_simulation_record(f, e, w)
+    table = float64_view(f.table, f.axes * TABLE_POINTS * 3).reshape((f.axes, TABLE_POINTS, 3))
     for _ in range(f.ticks):
-        convert_action_to_commands(f, e, action)
-        _run_control_period(f, e, sim)
+        convert_action_to_commands(f, e, action, table)
+        compute_servo_commands(f, e)
+        step_physics(sim, e.tick, f.substeps, e.command[: f.axes])
         e.tick += 1
         update_sensors(f, e, sim)
         _add_drive_work(f, e, sim)
@@ -346,10 +221,10 @@ def _run_environment_step(f, e, w, action):
     if _check_stability(f, e, w.data):
         e.fault = 1
         e.faults += 1
-        return _shape_reward(f, e, 0.0, 0.0), True, False
+        return shape_reward(f, e, 0.0, 0.0), True, False
     reward = call_task_part(f, w, REWARD, 0)
     done = e.over != 0
-    reward = _shape_reward(f, e, reward, 0.0 if done else _compute_potential(f, w))
+    reward = shape_reward(f, e, reward, 0.0 if done else _compute_potential(f, w))
     return reward, done, e.step >= f.horizon and not done
 
 

@@ -194,19 +194,19 @@ def mix64(z):
 
 
 @compiled
-def arm_values(f, values):
+def arm_values(f, values, out):
     """Return the values (k,) of the axes of the arm.
 
     Args:
         f: record of TASK_PARAMETERS.
         values: (>= axes,) of all axes.
+        out: (k,) written.
 
     Returns:
-        (k,) of the axes of the arm, from the swing outwards.
+        `out`: values of the axes of the arm, from the swing outwards.
 
     Source: the order of axes follows the pumps, see `actuator_layout.actuator_order`.
     """
-    out = np.empty(f.arm_axes)
     for a in range(f.arm_axes):
         out[a] = values[f.driven_axis[a]]
     return out

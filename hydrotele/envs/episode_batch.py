@@ -136,14 +136,14 @@ class TaskCore:
         check_count("num_envs", count, 1, MAX_ENVIRONMENTS)
         check_count("threads", threads, 0, MAX_THREADS)
         self.count, self.setup = int(count), make_task_setup(task, options)
+        self._allocate_arrays(self.count, autoreset)
         self.simulations = SimulationBatch(self.setup.variants.plant.model, count, threads)
-        self._allocate_arrays()
-        self.parameters = make_task_parameters(self.setup, count, autoreset)
-        self._store_array_addresses()
+        self._allocate_histories()
         self._is_started = np.zeros(count, bool)
 
-    def _allocate_arrays(self) -> None:
-        n, o, v = self.count, len(self.setup.fields), self.setup.variants
+    def _allocate_arrays(self, n: int, autoreset: int) -> None:
+        """Allocate the arrays of n episodes and make the record of parameters with their addresses."""
+        o, v = len(self.setup.fields), self.setup.variants
         self.episodes = np.zeros(n, EPISODE_STATE)
         self.action = np.zeros((n, len(self.setup.axes)), np.float32)
         self.observation, self.final_observation = (np.zeros((n, o), np.float32) for _ in range(2))
@@ -153,6 +153,17 @@ class TaskCore:
         self.measures, self.final_measures = (np.zeros((n, MAX_MEASURES)) for _ in range(2))
         self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
         self.terrain = np.zeros((n, self.setup.task.terrain_size))
+        self.parameters = make_task_parameters(self.setup, n, autoreset)
+        self._store_addresses(
+            episodes=self.episodes, action=self.action, observation=self.observation, final=self.final_observation,
+            low=self.observation_low, high=self.observation_high, reward=self.reward, terminated=self.terminated,
+            truncated=self.truncated, measures=self.measures, final_measures=self.final_measures,
+            start_tips=v.start_tips, scales=v.sensor_scales, offsets=v.sensor_offsets, terrain=self.terrain,
+        )  # fmt: skip
+
+    def _allocate_histories(self) -> None:
+        """Allocate delay lines, sensor histories and model fields of the variants for the simulations in MuJoCo."""
+        n, v = self.count, self.setup.variants
         self._commands = np.zeros((n, delay_line_length(v.command_delays, self.setup.clock.substeps), MAX_AXES))
         self._sensed = np.zeros((n, sensor_history_length(v.sensor_delays, v.lag_ratios), MAX_CHANNELS))
         self._sensed_before = np.zeros((n, MAX_CHANNELS))
@@ -164,28 +175,24 @@ class TaskCore:
         same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
         self._actuator_parameters = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
-    def _store_array_addresses(self) -> None:
-        """Store the addresses of all arrays in the record that native code reads."""
-        v, f = self.setup.variants, self.parameters
+        f = self.parameters
         f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
         rows = [(v.fields[n].ctypes.data, live.ctypes.data, v.fields[n].shape[1])
                 for n, live in self._expanded_fields.items()]  # fmt: skip
         self._field_addresses = np.array(rows, np.int64).reshape(-1, 3)
         f["fields"] = len(rows)
-        for name, array in (
-            ("episodes", self.episodes), ("action", self.action), ("observation", self.observation),
-            ("final", self.final_observation), ("low", self.observation_low), ("high", self.observation_high),
-            ("reward", self.reward), ("terminated", self.terminated),
-            ("truncated", self.truncated), ("measures", self.measures),
-            ("final_measures", self.final_measures), ("starts", v.states),
-            ("start_tips", v.start_tips), ("users", self._actuator_parameters), ("scales", v.sensor_scales),
-            ("offsets", v.sensor_offsets), ("lags", v.sensor_delays), ("ratios", v.lag_ratios),
-            ("delays", v.command_delays), ("commands", self._commands), ("sensed", self._sensed),
-            ("sensed_before", self._sensed_before), ("places", self._field_addresses), ("terrain", self.terrain),
-        ):  # fmt: skip
-            f[name] = array.ctypes.data
+        self._store_addresses(
+            starts=v.states, users=self._actuator_parameters, lags=v.sensor_delays, ratios=v.lag_ratios,
+            delays=v.command_delays, commands=self._commands, sensed=self._sensed, sensed_before=self._sensed_before,
+            places=self._field_addresses,
+        )  # fmt: skip
         if "eq_data" in self._expanded_fields:
             f["eq_rows"] = self._expanded_fields["eq_data"].ctypes.data
+
+    def _store_addresses(self, **arrays: np.ndarray) -> None:
+        """Store the addresses of arrays in the record that native code reads."""
+        for name, array in arrays.items():
+            self.parameters[name] = array.ctypes.data
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -229,9 +236,7 @@ class TaskCore:
         elif not self._is_started.all():
             raise RuntimeError("the first reset needs seeds")
         self._is_started = begun
-        self.parameters["call"] = RESET
-        ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
-        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data, ids)
+        self._run_call(RESET, chosen)
 
     def step(self, action: np.ndarray) -> None:
         """Advance all episodes by one environment step.
@@ -253,8 +258,13 @@ class TaskCore:
         if not np.isfinite(values).all():
             raise ValueError("all actions must be finite numbers")
         np.clip(values, -1.0, 1.0, out=self.action, casting="unsafe")  # large float64 numbers exceed float32
-        self.parameters["call"] = STEP
-        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data)
+        self._run_call(STEP, None)
+
+    def _run_call(self, call: int, chosen: np.ndarray | None) -> None:
+        """Step or reset the simulations `chosen` (None: all) by native code; `call` is STEP or RESET."""
+        self.parameters["call"] = call
+        ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
+        self.simulations.apply(step_or_reset_simulation.address, self.parameters.ctypes.data, ids)
 
     def step_single(self, action: np.ndarray) -> None:
         """Advance all episodes, normally a single one, like `step`; the action must have shape (a,)."""

@@ -46,6 +46,7 @@ class TrainingPlan:
         epochs: passes through the samples in an update.
         width: width of the two hidden layers.
         first_log_std: logarithm of the standard deviation of the first actions.
+        device: None to train on MuJoCo, "cpu" to train on the reduced model; the policy is evaluated on MuJoCo.
     """
 
     task: str
@@ -64,6 +65,7 @@ class TrainingPlan:
     epochs: int = 10
     width: int = 64
     first_log_std: float = -0.5
+    device: str | None = None
 
 
 @dataclasses.dataclass

@@ -215,6 +215,7 @@ def train_policy(
         raise InputError("training", "needs stable-baselines3: pip install 'hydrotele[learn]'")
     torch.set_num_threads(1)  # networks are small, and waiting threads take time from the physics
     taken = {"timestep": plan.timestep, **plan.options, "shaping": plan.gamma if plan.shaping else 0.0}
+    taken |= {} if plan.device is None else {"device": plan.device}
     plain = StableVecEnv(plan.task, plan.num_envs, plan.threads, **taken)
     env = VecNormalize(plain, norm_obs=False, gamma=plan.gamma)
     try:

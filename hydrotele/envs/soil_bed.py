@@ -176,7 +176,7 @@ def compute_bucket_edge_velocity(f, e, w, rates):
     """
     k = f.arm_axes
     jacobian = np.empty((k, k))
-    task_jacobian(f.arm, arm_values(f, e.position), jacobian)
+    task_jacobian(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), jacobian)
     rates[0], rates[1] = 0.0, 0.0
     for j in range(k):
         speed = w.qvel[f.dof[f.driven_axis[j]]]

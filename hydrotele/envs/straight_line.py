@@ -112,7 +112,7 @@ def draw_line_goal(f, e):
     """
     g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
     ratio = f.parameters[_SIZE_RATIO]
-    compute_tip_pose(f.arm, arm_values(f, e.position), start)
+    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), start)
     for c in range(4):
         g[_START + c] = start[c]
     speed, g[_ACCELERATION] = (
@@ -135,8 +135,8 @@ def draw_line_goal(f, e):
         g[_LENGTH], g[_SPEED] = length, size * speed
         for c in range(3):
             change[c] = length * g[_PER_METRE + c]
-        end = start + change
-        if end[_R] < ratio * _MIN_RADIUS or not _MIN_HEIGHT <= end[_Z] <= ratio * _MAX_HEIGHT:
+        radius, height = start[_R] + change[_R], start[_Z] + change[_Z]
+        if radius < ratio * _MIN_RADIUS or not _MIN_HEIGHT <= height <= ratio * _MAX_HEIGHT:
             continue
         if compute_path_effort(f, start, change) * g[_SPEED] / length <= _MAX_EFFORT:
             break
@@ -281,7 +281,7 @@ def compute_true_line_errors(f, e):
     compute_line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
     along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
-    arm = arm_values(f, e.position)
+    arm = arm_values(f, e.position, np.empty(f.arm_axes))
     attitude = arm[1] + arm[2] + arm[3] - pose[_ATTITUDE]
     return across, along, attitude
 
@@ -314,6 +314,16 @@ def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[
     ratio = size_ratio(machine, "cat215", "bucket")
     low, high = (4.8 * ratio, -0.5, 0.4 * ratio, -1.9), (6.5 * ratio, 0.5, 2.4 * ratio, -1.2)
     return sample_start_positions(machine, rng, low, high)
+
+
+@compiled
+def compute_line_potential(f, e):
+    """Return the potential of the sum of the true errors, see `compute_tracking_potential`.
+
+    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE.
+    """
+    across, along, attitude = compute_true_line_errors(f, e)
+    return compute_tracking_potential(f, across + abs(along) + abs(attitude))
 
 
 STRAIGHT_LINE = Task(
@@ -362,6 +372,5 @@ def run_task_part(part, m, d, number, argument, out):
     elif part == REWARD:
         return store_episode_end(e, compute_line_reward(f, e, w))
     elif part == POTENTIAL:
-        across, along, attitude = compute_true_line_errors(f, e)
-        return compute_tracking_potential(f, across + abs(along) + abs(attitude))
+        return compute_line_potential(f, e)
     return 0.0

@@ -307,7 +307,7 @@ def compute_measured_pose(f, e, pose):
 
     Source: `kinematics.task_space.compute_tip_pose`.
     """
-    compute_tip_pose(f.arm, arm_values(f, e.joint), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
 
 
 RECOVERY_SPEED = 0.5  # m/s, speed at which potentials assume that an error decreases

@@ -78,7 +78,7 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
 
     Args:
         task: name of the task, or another argument of `find_task`.
-        choices: fields of `envs.task.Options`.
+        choices: fields of `envs.task.Options`, and `device`: None for MuJoCo, "cpu" for the reduced model.
         count: number of environments.
         threads: number of threads that step the environments, 0 for one per core.
         autoreset: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
@@ -89,12 +89,18 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
     Raises:
         InputError: the task or an option does not exist, or a value is not valid.
     """
-    found = find_task(task)
+    found, choices = find_task(task), dict(choices)
+    if (device := choices.pop("device", None)) not in (None, "cpu"):
+        raise InputError("environment option 'device'", f"must be cpu, for the reduced model, not {device!r}")
     known = {field.name for field in dataclasses.fields(Options)}
     if strange := set(choices) - known:
         name = sorted(strange)[0]
         raise InputError(f"environment option {name!r}", suggest_valid_name(name, known))
     options = _validate_options(choices)
+    if device is not None:
+        from hydrotele.envs.reduced_core import ReducedCore  # loads the tracing of mechanisms
+
+        return ReducedCore(found, options, count, threads, autoreset)
     step_or_reset_simulation.compile_in_background(
         _COMPILE_LOOPS_COMMAND
     )  # while the plant's own code is compiled here

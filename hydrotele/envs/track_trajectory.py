@@ -192,6 +192,15 @@ def compute_track_reward(f, e, w):
     return max(-1.0, 1.0 - error / ERROR_PER_REWARD), False
 
 
+@compiled
+def compute_track_potential(f, e):
+    """Return the potential of the true tip error, see `compute_tracking_potential`.
+
+    `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE.
+    """
+    return compute_tracking_potential(f, compute_track_error(f, e))
+
+
 @callback(TASK_SIGNATURE)
 def run_task_part(part, m, d, number, argument, out):
     """Run one part of the task `TrackTrajectory` for the simulation `number`, in native code.
@@ -211,7 +220,7 @@ def run_task_part(part, m, d, number, argument, out):
     elif part == REWARD:
         return store_episode_end(e, compute_track_reward(f, e, w))
     elif part == POTENTIAL:
-        return compute_tracking_potential(f, compute_track_error(f, e))
+        return compute_track_potential(f, e)
     return 0.0
 
 
