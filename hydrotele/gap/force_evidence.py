@@ -185,7 +185,7 @@ def _shape_of(rest: np.ndarray, columns: Columns, free: float) -> NoiseShape:
     total = _fast_covariance(rest * weight, weight, starts, order, columns.spacing)[0]
     plain = plain._replace(std=np.maximum(np.sqrt(np.diag(total) / free), 1e-12))
 
-    def whiten(follow: np.ndarray) -> tuple[NoiseShape, np.ndarray, np.ndarray]:
+    def whiten(follow: np.ndarray) -> tuple[NoiseShape, np.ndarray, np.ndarray, np.ndarray, list[int]]:
         shape = plain._replace(follow=follow)
         new, memory = shape.prewhiten(rest, columns.doubt, starts), len(follow)
         there = np.concatenate([weight[a + memory : b] > 0.0 for a, b in zip(starts[:-1], starts[1:], strict=True)])

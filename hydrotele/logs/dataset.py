@@ -347,8 +347,8 @@ def describe_resting_axes(split: Split, axes: Sequence[str]) -> tuple[str, ...]:
     """
 
     def activity(parts: Sequence[RunPart]) -> np.ndarray:
-        changes = sum(np.nansum(np.abs(np.diff(part.rows.command, axis=0)), axis=0) for part in parts)
-        return changes / sum(run_duration(part.rows) for part in parts)
+        changes = [np.nansum(np.abs(np.diff(part.rows.command, axis=0)), axis=0) for part in parts]
+        return np.sum(changes, axis=0) / sum(run_duration(part.rows) for part in parts)
 
     fitted, held_out = activity(split.fit), activity([split.heldout])
     idle = [axis for axis, a, b in zip(axes, fitted, held_out, strict=True) if b < _MIN_HELD_OUT_CHANGE * a]

@@ -70,7 +70,7 @@ def measure_differences(task: str, count: int) -> list[float]:
 def main() -> None:
     asked = options(__doc__, count=1024, episodes=32, seconds=3.0)
     text = [
-        f'Environments on the reduced model (`device="cpu"`) beside those on MuJoCo. Speed: {asked.count} environments'
+        f'Environments on the reduced model (`device="cpu"`) compared with those on MuJoCo. Speed: {asked.count} environments'
         " with real sensors at 50 Hz, random actions, environment steps per second of processor time and core.\n",
         "| task | actions | MuJoCo | reduced model | ratio |",
         "| --- | --- | --- | --- | --- |",
