@@ -70,8 +70,8 @@ def measure_differences(task: str, count: int) -> list[float]:
 def main() -> None:
     asked = options(__doc__, count=1024, episodes=32, seconds=3.0)
     text = [
-        f'Environments on the reduced model (`device="cpu"`) compared with those on MuJoCo. Speed: {asked.count} environments'
-        " with real sensors at 50 Hz, random actions, environment steps per second of processor time and core.\n",
+        f'Environments on the reduced model (`device="cpu"`) and those on MuJoCo compared. Speed: {asked.count}'
+        " environments with real sensors at 50 Hz, random actions, environment steps per second of processor time and core.\n",
         "| task | actions | MuJoCo | reduced model | ratio |",
         "| --- | --- | --- | --- | --- |",
     ]
