@@ -71,7 +71,8 @@ def main() -> None:
     asked = options(__doc__, count=1024, episodes=32, seconds=3.0)
     text = [
         f'Environments on the reduced model (`device="cpu"`) and those on MuJoCo compared. Speed: {asked.count}'
-        " environments with real sensors at 50 Hz, random actions, environment steps per second of processor time and core.\n",
+        " environments with real sensors at 50 Hz, random actions, environment steps per second of processor time"
+        " and core.\n",
         "| task | actions | MuJoCo | reduced model | ratio |",
         "| --- | --- | --- | --- | --- |",
     ]
