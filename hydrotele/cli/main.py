@@ -94,7 +94,9 @@ def compare(
     ],
     data: Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")],
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machines.")] = None,
-    heldout: Annotated[str | None, typer.Option(help="Held-out run; default: test*, else the last run.")] = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Held-out run; default: test*, else the last; of one run its last quarter.")
+    ] = None,
     sensors: Annotated[str | None, typer.Option(help="Sensor set of the machines.")] = None,
     horizons: Annotated[
         str, typer.Option(help="Prediction horizons [s]; the end of the run is always included.")
@@ -279,7 +281,9 @@ MachineOption = Annotated[
 ToolOption = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
 LogsOption = Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")]
 MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More log files or folders.")]
-HeldOutOption = Annotated[str | None, typer.Option(help="Held-out run; default: test*, else the last run.")]
+HeldOutOption = Annotated[
+    str | None, typer.Option(help="Held-out run; default: test*, else the last; of one run its last quarter.")
+]
 SensorsOption = Annotated[str | None, typer.Option(help="Sensor set of the machine.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")]
 

@@ -43,10 +43,19 @@ class LogColumn(StrictModel):
     wrap: PositiveFloat | None = None
     minus: str | None = None
 
+    @pydantic.model_validator(mode="before")
+    @classmethod
+    def _read_minus(cls, data: Any) -> Any:
+        """Accept a minus in front of the channel, as in the short form."""
+        channel = data.get("channel") if isinstance(data, dict) else None
+        if isinstance(channel, str) and channel.startswith("-") and "sign" not in data:
+            return {**data, "channel": channel[1:].strip(), "sign": -1}
+        return data
+
     def convert(self, values: np.ndarray, minus: np.ndarray | None = None) -> np.ndarray:
         """Return the converted values (n,) of a column (n,); `minus` (n,) is the column to subtract.
 
-        >>> LogColumn(channel="angle.boom", wrap=360, sign=-1).convert(np.array([350.0, 355.0, 2.0]))
+        >>> LogColumn(channel="-angle.boom", wrap=360).convert(np.array([350.0, 355.0, 2.0]))
         array([-350., -355., -362.])
         """
         if self.wrap is not None:
