@@ -208,7 +208,7 @@ def find_force_gap(
     evidence, found = _search(task, effects, tell)
     tell("evaluate the patched model on the held-out run", 0.9)
     chances = _probabilities(evidence, found)
-    small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)}
+    small = {h.key for h, v in task.effects_of(found.guess) if _is_small(h, v)} | _brief_pulses(evidence, found.guess)
     judged, untrue = found.judged, list[str]()
     varying: dict[Key, str] = {}
     while varying := _varying(evidence, judged):
@@ -375,6 +375,17 @@ def _is_small(effect: ForceEffect, values: np.ndarray) -> bool:
     change = [(v - p.nominal) / p.min_relevant_change
               for v, p in zip(values, effect.parameters.values(), strict=True) if p in facts]  # fmt: skip
     return float(np.linalg.norm(change)) < 1.0
+
+
+def _brief_pulses(evidence: ForceEvidence, guess: Guess) -> set[Key]:
+    """Return pulses with a smaller RMS over all rows than a missing force must have."""
+    rms = np.sqrt(np.mean(evidence.columns.measured**2, axis=0))
+    found = set()
+    for h, deviation in guess.parts:
+        force = np.sqrt(np.mean(evidence.force_of(Guess(((h, deviation),))) ** 2, axis=0))
+        if interval_of(h) and np.max(force / rms) < MIN_FORCE_SHARE:
+            found.add(h.key)
+    return found
 
 
 def _numbers(values: Mapping[str, float]) -> str:

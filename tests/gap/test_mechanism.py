@@ -201,9 +201,10 @@ def test_dry_friction_of_a_plain_simulation_is_named(tmp_path, stribeck):
         np.savetxt(tmp_path / "logs" / f"{name}.csv", rows, delimiter=",", header="time,angle.j,torque.j", comments="")
     gap = found_gap(tmp_path)
     named = {(e.name, e.location): e.parameters for e in gap.effects}
-    assert set(named) == {("coulomb_friction", "j")}
-    # no effect of the library falls with the rate, so a part of Stribeck's effect may remain
-    assert gap.verdict in ("named", "partly" if stribeck else "named")
+    assert ("coulomb_friction", "j") in named
+    assert set(named) <= {("coulomb_friction", "j"), *([("stribeck_friction", "j")] if stribeck else [])}
+    # the rows near rest, where most of Stribeck's effect acts, are left out: its form is not certain
+    assert gap.verdict in ("named", *(("ambiguous", "partly") if stribeck else ()))
     dry = named["coulomb_friction", "j"]["coulomb"].value
     assert abs(dry - 1.0) < (0.15 if stribeck else 0.01)  # rows near rest, where the effect acts, are left out
 
