@@ -215,12 +215,12 @@ def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
     return ScenarioFile(path, *read_yaml(path))
 
 
-def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
+def load_scenario(name_or_path: str | Path, overrides: dict[str, Any] | None = None) -> Scenario:
     """Read a scenario from a shipped or the user's YAML file, replace given values, and validate the result.
 
     Args:
         name_or_path: name of a shipped scenario or path of a YAML file.
-        overrides: dotted key path -> YAML text, as in `--set servo.position_gain=2`.
+        overrides: dotted key path -> value, or YAML text as in `--set servo.position_gain=2`.
 
     Returns:
         The validated scenario.
@@ -229,10 +229,10 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
         InputError: the file is not valid; the message names file, line, key path and valid values.
 
     Examples:
-        Overrides have the form of `--set`: a key path and YAML text.
+        Overrides have the form of `--set`, a key path and YAML text, or are values.
 
         >>> import hydrotele as ht
-        >>> scenario = ht.load_scenario("rig_steps", {"duration": "2", "sensors": "ideal"})
+        >>> scenario = ht.load_scenario("rig_steps", {"duration": 2.0, "sensors": "ideal"})
         >>> scenario.machine, scenario.duration, scenario.row_count
         ('rig', 2.0, 2000)
         >>> try:
@@ -244,10 +244,10 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     return make_scenario(read_scenario_file(name_or_path), overrides)
 
 
-def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
+def make_scenario(file: ScenarioFile, overrides: dict[str, Any] | None = None) -> Scenario:
     """Return the validated scenario of a scenario file, after replacing given values.
 
-    `overrides` maps dotted key paths to YAML text, such as `servo.position_gain` to `2`. `file` is not
+    `overrides` maps dotted key paths to values or YAML text, such as `servo.position_gain` to `2`. `file` is not
     changed. If the pilot is a table in a log file, that log is read and its columns are stored in the
     scenario.
 
@@ -394,7 +394,7 @@ def save_scenario(scenario: Scenario, path: str | Path) -> None:
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False))
 
 
-def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
+def _apply_override(data: dict[str, Any], key: str, text: Any) -> None:
     where: Any = data
     parts = key.split(".")
     for part in parts[:-1]:
@@ -407,7 +407,7 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
         else:
             raise InputError(f"--set {key}", f"there is nothing below {part!r} to set")
     try:
-        value = parse_yaml_value(text)
+        value = parse_yaml_value(text) if isinstance(text, str) else text
     except (yaml.YAMLError, ValueError):
         raise InputError(f"--set {key}", f"{text!r} is not a YAML value") from None
     if isinstance(where, list) and parts[-1].isdigit() and int(parts[-1]) < len(where):
