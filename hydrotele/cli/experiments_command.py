@@ -99,14 +99,14 @@ def format_markdown(rows: Sequence[Comparison], series: Series) -> str:
 
 def _table(rows: Sequence[Comparison]) -> list[str]:
     lines = [
-        "| result | published | simulated [95 % interval] | verdict | criterion, reason |",
+        "| result (place in the document) | published | simulated [95 % interval] | verdict"
+        " | range that agrees (its source); explanation |",
         "| --- | --- | --- | --- | --- |",
     ]
     marks = {"additional": "; not in the publication", "caption": "; caption only"}
     for row in rows:
-        reason = ". ".join(part for part in (row.criterion, row.explanation) if part)
         cells = (f"{row.name} ({row.item}{marks.get(row.kind, '')})", row.published,
-                 row.simulated, row.verdict, reason)  # fmt: skip
+                 row.format_simulated_cell(), row.verdict, row.format_criterion_cell())  # fmt: skip
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return lines
 
