@@ -253,17 +253,18 @@ class Comparison(NamedTuple):
             lines.append(f"In addition: {self.evaluation.note}" if lines else self.evaluation.note)
         return "<br>".join(lines)
 
-    def format_criterion_cell(self) -> str:
+    def format_criterion_cell(self, only_ranges: bool = False) -> str:
         """Return the accepted ranges and the explanation as a cell of a Markdown table.
 
-        The numbers are those of `format_simulated_cell`. Checks with the same range share a line.
+        The numbers are those of `format_simulated_cell`. Checks with the same range share a line. With
+        `only_ranges`, the sources of the ranges and the explanation are omitted.
         """
         if self.evaluation.unavailable:
             return self.evaluation.unavailable
         checks = self.evaluation.checks
         shared: dict[tuple[str, str], list[int]] = {}
         for number, check in enumerate(checks, 1):
-            shared.setdefault((check.format_range(), check.reason), []).append(number)
+            shared.setdefault((check.format_range(), "" if only_ranges else check.reason), []).append(number)
         lines = [
             (f"{_list_numbers(numbers)}: " if len(checks) > 1 else "") + words + (f" ({reason})" if reason else "")
             for (words, reason), numbers in shared.items()
@@ -273,7 +274,7 @@ class Comparison(NamedTuple):
         if len(checks) > 1 and self.verdict in found:
             lines.append(". ".join(f"{label}: {_list_numbers(numbers)}" for label, numbers in zip(
                 ("Outside", "Partly outside"), found.values(), strict=True) if numbers))  # fmt: skip
-        if self.evaluation.explanation:
+        if self.evaluation.explanation and not only_ranges:
             lines.append(f"{'Reason' if self.verdict in found else 'Note'}: {self.evaluation.explanation}")
         return "<br>".join(lines)
 
