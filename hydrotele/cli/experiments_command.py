@@ -90,7 +90,9 @@ def format_markdown(rows: Sequence[Comparison], series: Series) -> str:
     lines = _table([row for row in rows if row.kind != "input"])
     inputs = [row for row in rows if row.kind == "input"]
     if inputs:
-        lines += ["", "## Published values used as inputs of the model", "", *_table(inputs)]
+        lines += ["", "## Published values used as inputs of the model", "",
+                  "The model was built from these values. The rows check that it contains them; they are not counted.",
+                  "", *_table(inputs)]  # fmt: skip
     if series.items_without_result:
         lines += ["", "## Tables and figures without a result", ""]
         lines += [f"- {item}: {content}" for item, content in series.items_without_result.items()]

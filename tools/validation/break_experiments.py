@@ -69,7 +69,7 @@ def format_introduction(name: str, count: int, failures: int) -> list[str]:
         f"Result: {count - failures} of {count} rows say *differs*{'' if failures else ', as required'}. Command:"
         f" `python tools/validation/break_experiments.py {name}`.", "",
         "How to read the table:", "",
-        "- Row: name of the row in the comparison, which states the published result.",
+        "- Row: name of the row in the comparison, which states the published result and explains the symbols.",
         "- Fault: what is changed in the simulation, for this row only.",
         "- Simulated with the fault: the quantities that the criterion needs. Brackets `[a, b]` are 95 % intervals over"
         " up to six repetitions with different random numbers;",
@@ -99,7 +99,7 @@ def list_rows_without_fault(series: Series) -> list[str]:
             [name for name, claim in claims.items() if claim.kind == "caption"],
         "These rows have no criterion, because they cannot be computed": [row.name for row in series.unavailable],
     }  # fmt: skip
-    return [line for words, names in groups.items() if names for line in (f"{words}: {', '.join(names)}.", "")]
+    return [line for words, names in groups.items() if names for line in (f"{words}: {'; '.join(names)}.", "")]
 
 
 if __name__ == "__main__":
