@@ -256,31 +256,26 @@ class Comparison(NamedTuple):
     def format_criterion_cell(self, only_ranges: bool = False) -> str:
         """Return the accepted ranges and the explanation as a cell of a Markdown table.
 
-        The numbers are those of `format_simulated_cell`. Checks whose ranges have the same source share a
-        line. With `only_ranges`, the sources of the ranges and the explanation are omitted.
+        The numbers are those of `format_simulated_cell`. Checks with the same range share a line. With
+        `only_ranges`, the sources of the ranges and the explanation are omitted.
         """
         if self.evaluation.unavailable:
             return self.evaluation.unavailable
         checks = self.evaluation.checks
-        shared: dict[str, dict[str, list[int]]] = {}  # source -> range -> numbers of the checks
+        shared: dict[tuple[str, str], list[int]] = {}
         for number, check in enumerate(checks, 1):
-            shared.setdefault("" if only_ranges else check.reason, {}).setdefault(check.format_range(), []).append(
-                number
-            )
+            shared.setdefault((check.format_range(), "" if only_ranges else check.reason), []).append(number)
         lines = [
-            "; ".join(
-                (f"{_list_numbers(numbers)}: " if len(checks) > 1 else "") + words for words, numbers in ranges.items()
-            )
-            + (f" ({reason})" if reason else "")
-            for reason, ranges in shared.items()
+            (f"{_list_numbers(numbers)}: " if len(checks) > 1 else "") + words + (f" ({reason})" if reason else "")
+            for (words, reason), numbers in shared.items()
         ]
-        if len(checks) > 1 and self.verdict in ("differs", "undecided"):
-            labels = {"differs": "Outside", "undecided": "Partly outside"}
-            found = {verdict: [number for number, check in enumerate(checks, 1) if check.verdict == verdict]
-                     for verdict in labels}  # fmt: skip
-            lines.append(". ".join(f"{labels[v]}: {_list_numbers(numbers)}" for v, numbers in found.items() if numbers))
+        found = {verdict: [number for number, check in enumerate(checks, 1) if check.verdict == verdict]
+                 for verdict in ("differs", "undecided")}  # fmt: skip
+        if len(checks) > 1 and self.verdict in found:
+            lines.append(". ".join(f"{label}: {_list_numbers(numbers)}" for label, numbers in zip(
+                ("Outside", "Partly outside"), found.values(), strict=True) if numbers))  # fmt: skip
         if self.evaluation.explanation and not only_ranges:
-            lines.append(f"Explanation: {self.evaluation.explanation}")
+            lines.append(f"{'Reason' if self.verdict in found else 'Note'}: {self.evaluation.explanation}")
         return "<br>".join(lines)
 
     def row(self) -> dict[str, Any]:

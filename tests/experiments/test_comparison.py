@@ -65,12 +65,12 @@ def test_cells_number_the_quantities_and_name_those_outside():
     assert (
         row.format_simulated_cell() == "(1) a = 1 m<br>(2) b = 3 m<br>(3) c = 4 m<br>(4) d = 5 m<br>In addition: more"
     )
-    assert row.format_criterion_cell() == "(1) to (4): 0 to 2 m (two)<br>Outside: (2) to (4)<br>Explanation: wear"
+    assert row.format_criterion_cell() == "(1) to (4): 0 to 2 m (two)<br>Outside: (2) to (4)<br>Reason: wear"
     assert row.format_criterion_cell(only_ranges=True) == "(1) to (4): 0 to 2 m<br>Outside: (2) to (4)"
     single = row._replace(evaluation=Evaluation(checks[:1], "wear"))
     assert (single.format_simulated_cell(), single.format_criterion_cell()) == (
         "a = 1 m",
-        "0 to 2 m (two)<br>Explanation: wear",
+        "0 to 2 m (two)<br>Note: wear",
     )
 
 
