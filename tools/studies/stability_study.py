@@ -205,7 +205,9 @@ def spring_table() -> list[str]:
     for gains in stick.gains:
         for axis in ("x", "y", "z"):
             row = stick.gains[gains][axis]
-            free = StiffnessAxis(stick.flotor.mass, row.damping, row.nominal, row.least, row.most)
+            free = StiffnessAxis(
+                stick.flotor.mass, row.damping, row.nominal_stiffness, row.min_stiffness, row.max_stiffness
+            )
             held = free.with_hand(Impedance(hand.mass, hand.damping, hand.stiffness))
             for name, one in (("held", held), ("released", free)):
                 lines.append(
