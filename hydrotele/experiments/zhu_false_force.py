@@ -128,9 +128,9 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
 
 def _evaluate_static_model(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
-        "false force of the static model in joint steps over that at rest",
+        "false force of the static model during joint steps over that at rest",
         collect_values(samples, "ratio"), (_MIN_MOTION_RATIO, np.inf),
-        "big: three times the error at rest",
+        "\"big\": at least three times the error at rest",
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'static_feller_joint_steps', 1e-3, 2)} kN RMS during the steps,"
