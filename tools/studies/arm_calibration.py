@@ -164,7 +164,9 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     each = np.sqrt(np.array(before) / np.array(after))
     half = clean_trials // 2
     lines += [
-        "This study asks whether the program finds corrupted readings by itself. There are"
+        "This study asks whether the program "
+        "finds corrupted readings without help."
+        " There are"
         f" {trials} measurements of {poses} poses per link, each of a different machine. One joint"
         " of the calibrator has an error of 1 to 4 deg in 10 to 33 % of the poses of one link (an offset, scatter or a"
         " temporary bend). A *region* is the range of consecutive poses that the program excludes. It counts as found"

@@ -89,8 +89,9 @@ def mukca(asked: argparse.Namespace) -> str:
     tip = np.array([t.tip for t in trials])
     lines = [
         "This study asks whether the reported intervals are right."
-        f" {many} simulated `{asked.robot}` robots with {'the same' if asked.same else 'random'} errors are calibrated:"
-        " lengths 0.3 mm, tilts 1 mrad, joint offsets 3 mrad, ball 2 mm (standard deviations)."
+        f" {many} simulated `{asked.robot}` robots with {'the same' if asked.same else 'random'}"
+        " errors are calibrated. The standard deviations of the errors are: lengths 0.3 mm, tilts 1 mrad, "
+        "joint offsets 3 mrad, ball 2 mm."
         f" Each is measured at 4 places with 2 sockets and {asked.rows} postures, with a ball play of"
         f" {1e3 * asked.play:g} mm and encoder noise of {1e6 * asked.encoder:g} urad.", "",
         "| intervals of | number | contain the true value [%] |", "| --- | ---: | ---: |",

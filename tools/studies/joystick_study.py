@@ -115,8 +115,9 @@ def steps() -> list[str]:
         lines.append(f"| {name} | {' | '.join(cells)} |")
     lines += [
         "",
-        "The deviation of about 5 % comes from the sampling period of 5 ms: a current is held for 5 ms, and the "
-        "velocity, a difference of two readings, is 2.5 ms old. In the next table the handle is held at its "
+        "The deviation of about 5 % comes from the sampling period of 5 ms. A current is held for 5 ms. The "
+        "velocity is a difference of two readings and therefore 2.5 ms old."
+        " In the next table the handle is held at its "
         "centre for 10 s (lower is better).",
         "",
         "| hovering for 10 s | largest error of the handle [um] | RMS [um] |"
@@ -165,8 +166,9 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
     worst = [np.max([np.abs(r[k].value - truth) for r in results], axis=0) for k in (0, 1)]
     lines = [
         "## Identification", "",
-        "The joystick identifies mass, centre of mass and moments of inertia of its flotor from its own readings "
-        "and currents, while it moves for 12 s with six tones per axis between 0.4 and 6 Hz. During this motion "
+        "The joystick can identify mass, centre of mass and moments of inertia of its flotor from its own "
+        "readings and currents. For this it moves for 12 s with six tones per axis between 0.4 and 6 Hz."
+        " During this motion "
         f"the control assumes wrong values: {GUESS.mass:g} kg, the centre of mass at the coils, and 2 g m^2 about "
         "every axis. All parameters are found within their intervals. Largest current "
         f"{np.abs(flight.currents).max():.2f} A, largest travel"
@@ -419,7 +421,8 @@ def force_over_the_gap() -> list[str]:
         "## Force over the gap", "",
         "Zhu 1994, 5.1.2: \"Due to the small motion range\" M is \"approximately\" constant; the "
         "loss of a coil is not stated. "
-        "The table shows what an unknown loss would cause. It assumes that a coil loses force quadratically "
+        "The table shows the consequences of an unknown loss. It assumes that a coil"
+        " loses force quadratically "
         "towards the end of the gap and that the control does not know this. First column: fraction lost at 5 "
         "mm. Errors: smaller is better.",
         "",
