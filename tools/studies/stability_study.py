@@ -270,10 +270,10 @@ def main() -> None:
         "contact force |",
         "| `four_channel_position`, `four_channel_rate` | motion and force, under position or "
         "rate control | motion and force |",
-        "| `wave_variables` | sums of force and velocity that keep the channel passive for "
-        "constant delay | the same |",
-        "| `passivity_control` | as `wave_variables`, with a damper that removes energy where "
-        "the channel would produce it | the same |",
+        "| `wave_variables` | a sum of force and velocity (wave), with which a channel of constant delay "
+        "produces no energy | the difference of both |",
+        "| `passivity_control` | position, limited so that no more energy leaves the channel than has entered "
+        "it | force of the slave's controller, limited in the same way |",
         "",
         "The columns:",
         "",
