@@ -572,7 +572,7 @@ def evaluate_bend_detection(samples: Sequence[Sample]) -> Evaluation:
     visible = collect_values(samples, "left out").mean()
     return Evaluation(
         (check_fraction("fraction of the calibrations in which the bent poses and one of the bent joints are found",
-                        found, (0.9, 1.0), "nine of ten, as with errors of one joint"),),
+                        found, (0.9, 1.0), "nine of ten, the limit for errors of one joint"),),
         "the parameters of the stage, identified from the same poses, absorb bends of two joints"
         f" that increase smoothly; the nominal model detects {100 * visible:.0f} % of the"
         " bent poses",
