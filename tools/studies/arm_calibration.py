@@ -180,9 +180,12 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
         f" {100 * possible / max(trials, 1):.1f} % |",
         f"| false alarms, held links fixed | {alarms['fixed']} of {half} |",
         f"| false alarms, held links drifting | {alarms['drifting']} of {half} |",
-        f"| RMS error of all parameters relative to expected sizes, with bad data | {one:.4f} |",
-        f"| the same without bad data | {two:.4f}, {one / two:.1f} times smaller |",
-        f"| ratio by trial: median, 10 % quantile | {np.median(each):.1f},"
+        "| RMS error of all parameters relative to their expected sizes, with bad data (lower is better) |"
+        f" {one:.4f} |",
+        f"| the same after the program has excluded the regions that it found | {two:.4f}, {one / two:.1f} "
+        "times smaller |",
+        "| ratio of both errors in single trials: median, 10 % quantile |"
+        f" {np.median(each):.1f},"
         f" {np.quantile(each, 0.1):.1f} |",
         "", "Trials in which the joint is not identified (stage, joint and poses with the error; joint and poses found;"
         " overlap):", *(f"- {m}" for m in misses),
