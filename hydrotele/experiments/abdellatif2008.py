@@ -265,7 +265,8 @@ def evaluate_designed_excitation(samples: Sequence[Sample]) -> Evaluation:
                 "motion",
                 collect_values(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
                 (1.0, np.inf), "the designed motion is more precise"),
-            check_deterministic_value("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
+            check_deterministic_value("use of the tightest limit", samples[0].values["use"], (0.0, 1.0),
+                                      "within all limits, equation (25)"),
         ),
         note="logarithm of the determinant of the information matrix"
         f" {samples[0].values['designed']:.1f}; of the best random"
