@@ -186,7 +186,7 @@ def _evaluate_hand_force_proportionality(samples: Sequence[Sample]) -> Evaluatio
         collect_values(samples, "line"), (0.0, _MAX_DEVIATION),
         "proportional, except for damping and inertia of the moving handle",
     )  # fmt: skip
-    note = f"from a line of fixed slope {format_values(samples, 'fixed_line', 100.0, 0)} %"
+    note = f"RMS deviation from a line of fixed slope: {format_values(samples, 'fixed_line', 100.0, 0)} %"
     return Evaluation((check,), "the slope follows the contact force (4.1)", note)
 
 
@@ -202,7 +202,7 @@ def _evaluate_direct_feedback(samples: Sequence[Sample]) -> Evaluation:
                        " ripple", collect_values(samples, "ripple") < _MAX_RIPPLE),
     )  # fmt: skip
     note = (
-        f"{format_values(samples, 'held', 1e-3)} kN with {samples[0].values['ratio']:.1e} N/N,"
+        f"contact force {format_values(samples, 'held', 1e-3)} kN with {samples[0].values['ratio']:.1e} N/N,"
         f" ripple {format_values(samples, 'ripple', 100.0, 0)} %"
     )
     explanation = (
@@ -388,7 +388,7 @@ def _evaluate_tracking(samples: Sequence[Sample]) -> Evaluation:
                 "on",
         ))  # fmt: skip
     note = "; ".join(
-        f"{words}: {format_values(samples, f'stiffness_{key}', 1e-3)} kN with reflection,"
+        f"RMS error {words}: {format_values(samples, f'stiffness_{key}', 1e-3)} kN with reflection,"
         f" {format_values(samples, f'none_{key}', 1e-3)} kN without"
         for key, words in (("detent", "with detents"), ("plain", "without detents"))
     )

@@ -99,7 +99,7 @@ def _evaluate_line(samples: Sequence[Sample]) -> Evaluation:
                    "constant: the width of a drawn line on the plot's axis of 60 deg", unit="deg"),
     )  # fmt: skip
     note = (
-        f"deviates by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
+        f"largest deviation {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
         f" {format_values(samples, 'sideways', 1e3, 0)} mm"
     )
     return Evaluation(checks, "the thesis gives no values", note)

@@ -349,7 +349,7 @@ def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
                 f"{format_values(samples, 'stray kinematics', 1e3)} mm even with inverse kinematics. "
                 "Deviations are large only with open joint loops: "
                 f"{format_values(samples, 'stray rates', 1e3, 0)} mm",
-        note=f"{format_values(samples, 'stray jacobian', 1e3)} mm with the inverse Jacobian,"
+        note=f"largest deviation {format_values(samples, 'stray jacobian', 1e3)} mm with the inverse Jacobian,"
         f" {format_values(samples, 'stray kinematics', 1e3)} mm with inverse kinematics",
     )  # fmt: skip
 
@@ -369,7 +369,7 @@ def evaluate_motion_accuracy(samples: Sequence[Sample]) -> Evaluation:
         " kinematics with open loops is"
         f" {format_values(samples, 'stray open', 1e3, 0)} mm, that of the"
         f" inverse Jacobian with closed loops {format_values(samples, 'stray jacobian', 1e3)} mm",
-        note=f"{format_values(samples, 'stray kinematics', 1e3)} mm with closed loops,"
+        note=f"largest deviation {format_values(samples, 'stray kinematics', 1e3)} mm with closed loops,"
         f" {format_values(samples, 'stray rates', 1e3, 0)} mm with open loops, in a travel of 1.4 m",
     )  # fmt: skip
 

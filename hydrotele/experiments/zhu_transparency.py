@@ -262,7 +262,8 @@ def evaluate_destabilizing_force_error(samples: Sequence[Sample]) -> Evaluation:
         f" by {v['scale']:.2g}, or the hand's stiffness by {v['hand']:.2g}; gains, hand and task"
         " of the reported system are not in the document. With 5 % the two-port is no longer"
         f" passive (scattering norm {v['norm']:.4f})",
-        note=f"with 5 ms each way {v['late']:.3g}; CAT 215 as the slave {v['machine']:.3g}",
+        note=f"smallest unstable error with a delay of 5 ms each way: {v['late']:.3g}; with the CAT 215 as the slave:"
+        f" {v['machine']:.3g}",
     )  # fmt: skip
 
 

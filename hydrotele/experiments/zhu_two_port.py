@@ -323,8 +323,8 @@ def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
         (check_mean("position error due to contact over the RMS noise of the measured"
                     " position", collect_values(samples, "ratio"), (-np.inf, 1.0),
                     "smaller than the noise"),),
-        note=f"{format_values(samples, 'shift', 1e3)} mm with"
-        f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
+        note=f"position error {format_values(samples, 'shift', 1e3)} mm with a contact force of"
+        f" {format_values(samples, 'force', 1e-3)} kN; RMS noise {format_values(samples, 'noise', 1e3)}"
         " mm, from the angle sensors of khoshzaban1992",
     )  # fmt: skip
 
@@ -381,7 +381,7 @@ def evaluate_rate_force_margin(samples: Sequence[Sample]) -> Evaluation:
             check_deterministic_value("this factor over that of position control", ratio, (0.0, 1.0 - 1e-9),
                         "rate control is less stable"),
         ),
-        note=f"with 20 ms each way {v['late_rate']:.2f} under rate control,"
+        note=f"largest stable factor with 20 ms each way: {v['late_rate']:.2f} under rate control,"
         f" {v['late_position']:.2f} under position control: with delay position control is less"
         " stable at these gains",
     )  # fmt: skip
