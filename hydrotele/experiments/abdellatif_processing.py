@@ -243,7 +243,7 @@ def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
     """
     checks = tuple(
         check_bootstrapped_statistic(
-            f"error variance, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
+            f"error variance of the predicted force, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
             collect_values(samples, f"{one} variance") / collect_values(samples, f"{other} variance"),
             lambda ratios: float(np.exp(np.mean(np.log(ratios)))), (0.0, 1.0),
             "smaller")
