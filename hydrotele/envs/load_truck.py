@@ -497,12 +497,12 @@ _CYCLE_TASK = Task(
     ),
     reward=(
         "The reward is 10 per m3 in the truck. Every m3 spilled costs 10, every MJ of hydraulic energy 1, every"
-        " second 0.1, and every 10 kN s of force on the truck 1. In addition, the reward contains the change of a"
-        " potential, which rewards progress: each m3 in the bucket adds 3, rising to 7 above the truck; an empty"
+        " second 0.1, and every 10 kN s of force on the truck 1. In addition, the change of a potential rewards"
+        " progress. Each m3 in the bucket has the potential 3, which rises to 7 above the truck. An empty"
         " bucket has -2 far from the bank and 0 at the bank. Success ends the episode with an additional reward of"
-        " 10. Success is a full truck in `cycle`; 0.45 m3 in the bucket, lifted 0.3 m above the bank, in `dig`; the"
-        " bucket above the bed with 80 % of its load in `haul`; an empty bucket with 80 % of its load in the truck"
-        " in `dump`; and the bucket edge above the bank in `return`. A force above 100 kN on the truck ends the"
+        " 10. In `cycle`, success is a full truck; in `dig`, it is 0.45 m3 in the bucket, lifted 0.3 m above the bank."
+        " In `haul`, it is the bucket above the bed with 80 % of its load; in `dump`, an empty bucket with 80 % of its"
+        " load in the truck; in `return`, the bucket edge above the bank. A force above 100 kN on the truck ends the"
         " episode with -20."
     ),
     machine="cat215",
