@@ -103,15 +103,17 @@ def main() -> None:
         "",
         f"Both motions are simulated for 60 s with the sensors of the CAT 215 in {asked.trials} trials. The "
         f"design varies the amplitudes and phases of {asked.harmonics} harmonics and keeps the limits of "
-        f"stroke, speed, flow and pressure; it starts from {asked.starts} random motions. It maximises the "
+        f"joint range, stroke, flow and pressure; it starts from {asked.starts} random motions. It maximises the "
         "determinant of the information matrix, that is, it minimises the volume of the joint confidence "
         f"region (D-optimal design). The criterion counts {len(base)} [base parameters](../terms.md): those "
         "that a random motion determines despite the sensor noise. More are determined by logs without noise "
         "([identifiability](identifiability.md)).",
         "",
         "| quantity | value |", "| --- | ---: |",
-        f"| information per parameter, designed motion relative to `{OLD}` (root of the determinants' ratio) | {better:.1f} |",
-        f"| largest use of a limit (stroke, speed, flow, pressure) by the designed motion | {100 * new.max_utilisation:.0f} % |",
+        f"| information per parameter, designed motion relative to `{OLD}` (root of the determinants' ratio) |"
+        f" {better:.1f} |",
+        "| largest use of a limit (joint range, stroke, flow, pressure) by the designed motion |"
+        f" {100 * new.max_utilisation:.0f} % |",
         f"| parameters determined by both motions | {len(both)} |",
         f"| parameters determined by `{OLD}` / by the designed motion |"
         f" {len(stds[0])} / {len(stds[1])} |",
