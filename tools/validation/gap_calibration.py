@@ -85,8 +85,8 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     for test, limit in LIMITS.items():
         rows[f"worst channel, {test}"] = ([n["tests"][test] for n in noted.values()], limit)
     lines = [
-        f"Gap finding must not name an effect if nothing is hidden. {len(noted)} simulated unchanged machines are searched;"
-        " motions and sensors are those of the [blind validation](blind_trials/summary.md).",
+        f"Gap finding must not name an effect if nothing is hidden. {len(noted)} simulated unchanged machines are"
+        " searched; motions and sensors are those of the [blind validation](blind_trials/summary.md).",
         "",
         "- score of the best effect: how much the best effect improves twice the log [evidence](../terms.md), less a"
         f" penalty for its parameters. An effect is added to the model only above {ENTER:g}.",
@@ -109,10 +109,10 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     lines += ["", f"Number of machines on which an effect is above the threshold and large enough to name: {count}."]
     pulled = [n["pulls"] for n in noted.values() if n["pulls"]]
     if pulled:
-        lines += ["", f"Second table: each effect is estimated on {len(pulled)} unchanged machines, so its true value is"
-                  " the nominal one. The RMS of the estimate's error divided by its stated standard deviation should be 1."
-                  " Below 1 the stated uncertainty is too large, above 1 too small. 0 means that these logs do not"
-                  " determine the effect, and the estimate stays at its nominal value.",
+        lines += ["", f"Second table: each effect is estimated on {len(pulled)} unchanged machines, so its true value"
+                  " is the nominal one. The RMS of the estimate's error divided by its stated standard deviation should"
+                  " be 1. Below 1 the stated uncertainty is too large, above 1 too small. 0 means that these logs do"
+                  " not determine the effect, and the estimate stays at its nominal value.",
                   "", "| effect | RMS |", "| --- | --- |"]  # fmt: skip
         document["pulls"] = {}
         for key in pulled[0]:

@@ -26,8 +26,9 @@ _CRITERIA = {
 
 _WEAK = (
     "[Visibility](../../terms.md) measures how strongly an effect changes the readings, in standard deviations of the"
-    f" noise. An effect is weak if its visibility is below {DETECTABLE:g}. To miss a weak effect is no error in the rows"
-    " without weak ones; to name another effect instead is an error. Single effects by visibility, including weak ones:"
+    f" noise. An effect is weak if its visibility is below {DETECTABLE:g}. To miss a weak effect is no error in the"
+    " rows without weak ones; to name another effect instead is an error. Single effects by visibility,"
+    " including weak ones:"
 )
 
 
@@ -72,8 +73,8 @@ def markdown(series: Any, scores: dict[str, Any], control: dict[str, Any], verdi
         lines.append(f"| {_CRITERIA.get(name, name)} | {value} | {target['asked']} | {word} |")
     lines += [
         "",
-        "Each row is a class: one effect of the library (single), two (double), none (clean), or an effect that the library"
-        " does not contain (outside). Correct: fraction, number of trials, and its 95 % interval in per cent.",
+        "Each row is a class: one effect of the library (single), two (double), none (clean), or an effect that the"
+        " library does not contain (outside). Correct: fraction, number of trials, and its 95 % interval in per cent.",
         "",
         "| class | correct | without weak effects | verdicts |",
         "| --- | --- | --- | --- |",
