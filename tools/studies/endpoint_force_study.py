@@ -262,8 +262,8 @@ def parameters(results: list[dict]) -> list[str]:
         "## Static model", "",
         "The static estimator computes the joint torques of gravity as `tau = Y(q) P`: Y depends on the "
         "joint angles q, and P has the six gravity parameters of the table. C2 and S2 are the factors of the "
-        "cosine and sine of joint angle 2 (boom), C23 and S23 those of the sum of angles 2 and 3 (stick), "
-        "C234 and S234 those with angle 4 (bucket). This table tests whether slow motions "
+        "cosine and sine of joint angle 2 (boom). C23 and S23 belong to the sum of angles 2 and 3 (stick). "
+        "C234 and S234 also include angle 4 (bucket). This table tests whether slow motions "
         "(`scenarios/slow_moves.yaml`, the machine's sensors) identify P. Columns:",
         "",
         "- links alone, all masses: true values, computed from the masses of the links, without and with "

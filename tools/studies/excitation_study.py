@@ -121,10 +121,10 @@ def main() -> None:
         f"{np.median(list(ratios.values())):.2f} |", "",
         "A parameter is a mass property or a friction coefficient of a link or drive, in SI units. "
         "`boom_rod` and `stick_rod` are the cylinders of boom and stick. `inertia_xy` is an element of the "
-        "inertia matrix, `moment_x` mass times the x coordinate of the centre of mass, `coulomb` dry "
-        "friction, `stribeck` additional dry friction near zero speed, `viscous` friction per speed, "
-        "`offset` a constant force of a drive. Std: standard deviation of the estimate, smaller is better. "
-        "Ratio: first std over second; above 1 the designed motion is better.",
+        "inertia matrix, and `moment_x` is mass times the x coordinate of the centre of mass. `coulomb` is "
+        "dry friction, `stribeck` additional dry friction near zero speed, and `viscous` friction per speed. "
+        "`offset` is a constant force of a drive. Std: standard deviation of the estimate, smaller is "
+        "better. Ratio: first std over second; above 1 the designed motion is better.",
         "",
         "| parameter | std, `excitation` | std, designed | ratio |",
         "| --- | ---: | ---: | ---: |",

@@ -242,10 +242,10 @@ def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -
         "",
         "## Direct force: predicted and simulated limit",
         "",
-        "Each row is one setting. It states what differs from the reference in the first row: the speed of "
-        "the tip along z with the handle at its stop, the stiffness of the plate, the delay of the "
-        "communication channel, or the bandwidth of the filter that estimates the machine force. All limits "
-        "are ratios in 1e-5. `frequency` is that of the oscillation at the predicted limit.",
+        "Each row is one setting. It states what differs from the reference in the first row. This is the "
+        "speed of the tip along z with the handle at its stop, or the stiffness of the plate. It may also be "
+        "the delay of the communication channel, or the bandwidth of the filter that estimates the machine "
+        "force. All limits are ratios in 1e-5. `frequency` is that of the oscillation at the predicted limit.",
         "", *limits_table(bare, shipped), "",
         "The first four columns of figures have no dead bands: those of joystick and valves are zero, "
         "sensors are ideal, and the speed per displacement is the same. This is the case that a linear "

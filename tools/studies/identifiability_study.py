@@ -23,14 +23,14 @@ def report() -> str:
         "compares the counts with Table 13 of Khoshzaban 1992. With the assumptions of the thesis the counts "
         "are equal. With real pins at the cylinder ends, six fewer combinations can be identified.",
         "",
-        "A parameter is fully identifiable if its value can be computed, linearly identifiable if only a sum "
-        "with other parameters can, and unidentifiable if it has no effect or only repeats the effect of "
-        "others. The regressor, the matrix that relates the parameters to the drive forces, is evaluated in "
-        "300 independent random states of motion. Its rank is the number of [base parameters](../terms.md), "
-        "the independent combinations that can be identified. Unidentifiable is 82 minus the rank (thesis, "
-        "p. 100). The last column gives the singular values of the regressor before and after the rank, "
-        "relative to the largest one, with columns scaled to length 1. A large step between them means that "
-        "the rank is certain.",
+        "A parameter is fully identifiable if its value can be computed. It is linearly identifiable if only "
+        "a sum with other parameters can be computed. It is unidentifiable if it has no effect or only "
+        "repeats the effect of others. The regressor, the matrix that relates the parameters to the drive "
+        "forces, is evaluated in 300 independent random states of motion. Its rank is the number of [base "
+        "parameters](../terms.md), the independent combinations that can be identified. Unidentifiable is 82 "
+        "minus the rank (thesis, p. 100). The last column gives the singular values of the regressor before "
+        "and after the rank, relative to the largest one, with columns scaled to length 1. A large step "
+        "between them means that the rank is certain.",
         "",
         "| cylinder ends | rank | unidentifiable | linearly identifiable |"
         " fully identifiable | singular values at the rank |",

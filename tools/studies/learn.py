@@ -250,8 +250,8 @@ def main() -> None:
     lines = [
         tabulate_scores(scores, figures),
         "",
-        "Difference in the same episodes, learned controller minus tuned reference, also in standard errors (above 3 the"
-        " difference is certain):\n",
+        "Difference in the same episodes, learned controller minus tuned reference, also in standard errors (above 3"
+        " the difference is certain):\n",
     ]
     lines += [f"- {difference(scores, figure)}" for figure in figures]
     text = "\n".join(lines)
@@ -284,12 +284,12 @@ def head(asked: argparse.Namespace) -> str:
         f"- The network, trained with PPO in {facts['steps']:,} steps, {does}. Its input is the"
         f" last {recipe.history} steps.\n"
         f"- Both controllers have {options}. {machines}\n"
-        f"- The reference was tuned on the training machines (`--tune`): {gains}. These are gains of the joint servo"
-        " ([source](../../hydrotele/scenario/scenario.py), `Servo`) in 1/s (`position`, `swing`, `pressure`), s (`lead`,"
-        " `load_time`) and 1/s^2 (`integral`). `swing` replaces `position` for the swing, `integral` is an added integral"
-        " term.\n"
-        f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return (sum of rewards) and a smaller"
-        " tip error are better. `zero` takes no action."
+        f"- The reference was tuned on the training machines (`--tune`): {gains}. These are gains of the "
+        "joint servo ([source](../../hydrotele/scenario/scenario.py), `Servo`) in 1/s (`position`, "
+        "`swing`, `pressure`), s (`lead`, `load_time`) and 1/s^2 (`integral`). `swing` replaces "
+        "`position` for the swing, `integral` is an added integral term.\n"
+        f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return (sum of rewards) and a"
+        " smaller tip error are better. `zero` takes no action."
     )
 
 

@@ -153,8 +153,8 @@ def main() -> None:
     )
     count, seconds = speed()
     rows.append(
-        f"| time of the regressor (matrix that relates parameters to drive forces), {count} rows, 24 joints, 19 bodies |"
-        f" {seconds:.2f} s on one core |"
+        f"| time of the regressor (matrix that relates parameters to drive forces), {count} rows, 24 joints,"
+        f" 19 bodies | {seconds:.2f} s on one core |"
     )
     publish("\n".join(rows) + "\n", "Kinematics of the hexapod PaLiDA", asked)
 
