@@ -49,6 +49,25 @@ Cells are mean ± standard error over the episodes, with the unit in brackets ([
 Limit: all machines are simulated; randomised scores hold for this distribution only.
 """
 
+TASK_LINES = {
+    "TrackTrajectory": "All axes of an excavator follow moving references. `tip_error`: distance of the tip from its "
+    "reference.",
+    "StraightLine": "The tip of the bucket moves along a straight line. `cross_track_error`: distance from the line; "
+    "`along_track_error`: distance ahead or behind along it; `attitude_error`: error of the bucket's "
+    "angle.",
+    "HoldForce": "The bucket presses on a plate with a given force of 10 to 35 kN. `force_error`: difference from it; "
+    "`contact`: the bucket touches the plate; `overload`: more than 100 kN.",
+    "ReachFeller": "A feller-buncher moves its head to a pose. `distance` and `attitude_error`: remaining distance and "
+    "angle.",
+    "Grade": "A bucket cuts a low bank of soil down to a plane. `profile_rms`: error of the profile; "
+    "`carried_mass`: soil in the bucket; `soil_force`: force of the soil.",
+    "PlaceLog": "A grapple picks up a log and lays it down at a goal. `log_distance` and `yaw_error`: from log to "
+    "goal; `swing_angle`: of the freely swinging grapple.",
+    "LoadTruck": "An excavator fills a truck with soil. Volumes are loaded into the truck, carried in the bucket, "
+    "spilled, and removed from the bank; `energy`: hydraulic; `truck_force`: contact with the truck; "
+    "`loads`: bucket loads.",
+}
+
 
 def names(scores: Scores) -> list[str]:
     """Return the column names: RMS of continuous measures, final value of flags."""
@@ -70,7 +89,7 @@ def row(cells: list[str]) -> str:
 def table(name: str, asked) -> list[str]:
     """Lines of the table of a task."""
     task = TASKS[name]
-    lines = [f"\n## {name}\n"]
+    lines = [f"\n## {name}\n", *([TASK_LINES[name], ""] if name in TASK_LINES else [])]
     spread = typical_variation(load_machine(task.machine, task.tool))
     actions = asked.actions.split(",") if asked.actions else [task.action]
     columns: list[str] = []
