@@ -93,8 +93,10 @@ def main() -> None:
         "loop is stable. This study checks both against simulations of the two masses. Required are an "
         "impedance error of at most 3 %, and the right stability in 95 % of the cases.",
         "",
-        "Each row is one control structure. Its name says what is sent: position or rate to the slave, and "
-        "position or force back; four channels send position or rate and force both ways. Columns:",
+        "Each row is one control structure. In `position_position` (coordinating force) positions are sent "
+        "both ways. In `position_force` (direct force) a position is sent to the slave and a force back. "
+        "Four-channel structures send motion and force both ways. `rate_` structures and `four_channel_rate` "
+        "are the same under rate control. Columns:",
         "",
         "- impedance error: largest error of the formula against a simulation in which the handle is moved "
         "by sines of 0.1 to 5 Hz; smaller is better;",
