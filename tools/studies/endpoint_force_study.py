@@ -54,8 +54,8 @@ WINDOWS = {"free, lowering": (1.0, 2.5), "pressed, at rest": (5.5, 8.0),
 LIMITS = (
     "## Limits",
     "",
-    "- The 95 % intervals assume white errors and are too narrow: the remaining errors come from "
-    "inertia and the shape of friction.",
+    "- The 95 % intervals of the static model are too narrow. They assume independent errors, but the "
+    "remaining errors come from inertia and the shape of friction.",
     "- About two thirds of the remaining false force come from the noise of the pressures. The "
     "rest is friction of motions too slow to be distinguished from rest.",
     "- A faster estimate has a larger false force. On `zhu_up` the dynamic estimate is worse "

@@ -166,8 +166,8 @@ def main() -> None:
         lines = [
             "How much does an identified model improve the control of a path? A controller adds the drive "
             "forces that an inverse dynamics model predicts (feedforward) to joint feedback, after "
-            "Abdellatif 2008, Figs 10 to 12. With the identified model the tip follows its path about ten to "
-            "forty times more accurately than with the given model.",
+            "Abdellatif 2008, Figs 10 to 12. With the identified model the tip follows its path 13 to 42 "
+            "times more accurately than with the given model.",
             "",
             "Swing, boom and stick of the CAT 215 with a force drive on each joint (no hydraulics) follow a "
             "circle and a square. The simulated machine differs in masses and friction from the given model. "
