@@ -139,8 +139,8 @@ def describe_phases(core: TaskCore, found: dict[str, np.ndarray]) -> str:
     """Return the table of the time that each phase takes, and of what limits it."""
     loads, axes = core.measures[:, LOADS].sum(), core.setup.axes
     rows = [
-        "The next table shows where the time of a cycle goes and what limits the speed: the fraction of the time in which"
-        " the pump flow, or the rate limit of an axis' servo, is reached.\n",
+        "The next table shows where the time of a cycle goes and what limits the speed: the fraction of the time in"
+        " which the pump flow, or the rate limit of an axis' servo, is reached.\n",
         f"| phase | s per cycle | pump flow limits [%] | {' | '.join(f'{axis} at its rate [%]' for axis in axes)} |",
         "| --- |" + " ---: |" * (2 + len(axes)),
     ]
@@ -157,8 +157,8 @@ def describe_phases(core: TaskCore, found: dict[str, np.ndarray]) -> str:
 def describe_single_phases(seed: int) -> str:
     """Return the table of the single phases: success and return of reference controller, zero and random actions."""
     rows = [
-        "Each phase of the cycle is also a separate environment. Mean return ± standard error of the reference controller,"
-        " of no action (zero) and of random actions; success is a fraction of episodes.\n",
+        "Each phase of the cycle is also a separate environment. Mean return ± standard error of the reference"
+        " controller, of no action (zero) and of random actions; success is a fraction of episodes.\n",
         "| phase | reference: success | return | zero: return | random: return |",
         "| --- |" + " ---: |" * 4,
     ]
@@ -180,8 +180,8 @@ def describe_single_phases(seed: int) -> str:
 def describe_speed(steps: int) -> str:
     """Return the table of the speed with the actions of the reference controller, in processor time."""
     rows = [
-        'Speed of the environment by number of environments and threads. A step is 20 ms. "With controller" includes the'
-        " reference controller.\n",
+        'Speed of the environment by number of environments and threads. A step is 20 ms. "With controller" includes'
+        " the reference controller.\n",
         "| environments | threads | processor time per step [us] | with controller [us] | steps/s per core | times real"
         " time per core | elapsed time: steps/s |",
         "| ---: |" + " ---: |" * 6,
