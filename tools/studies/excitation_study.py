@@ -119,6 +119,9 @@ def main() -> None:
         f" {len(stds[0])} / {len(stds[1])} |",
         f"| standard deviation of a parameter, `{OLD}` over designed motion, median | "
         f"{np.median(list(ratios.values())):.2f} |", "",
+        "The first two rows describe the design: information above 1 favours the designed motion, and the "
+        "use of a limit must not exceed 100 %. In the last row, a value above 1 favours the designed motion.",
+        "",
         "A parameter is a mass property or a friction coefficient of a link or drive, in SI units. "
         "`boom_rod` and `stick_rod` are the cylinders of boom and stick. `inertia_xy` is an element of the "
         "inertia matrix, and `moment_x` is mass times the x coordinate of the centre of mass. `coulomb` is "

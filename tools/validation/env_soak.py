@@ -33,7 +33,8 @@ def main() -> None:
         "an unstable simulation. These four columns must be 0.\n",
         "Each row is one task with one kind of actions and sensors. Actions are uniformly random, each held "
         "for a random number of steps; observations are tested after every step. Saturated readings, which "
-        "are allowed, count sensor values beyond the limits of the space that were cut off at the limit.\n",
+        "are allowed, count sensor values beyond the limits of the space that were cut off at the limit. "
+        "The last column is the speed of the test.\n",
         "| task | actions | sensors | steps | episodes | not finite | outside the space | MuJoCo's"
         " warnings | unstable | saturated readings | physics steps/s |",
         "| " + " | ".join(["---"] * 11) + " |",
