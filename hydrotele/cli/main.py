@@ -944,7 +944,8 @@ def experiments(
 
 
 @app.command(
-    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json   |   hydrotele bench --device cpu"
+    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json   |   "
+    "hydrotele bench --device cpu"
 )
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
