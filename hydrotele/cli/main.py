@@ -932,8 +932,8 @@ def experiments(
 ) -> None:
     """Repeat the experiments of a publication; compare its tables and figures with simulation.
 
-    Each row states the published value, the simulated one with its 95 % interval, and a verdict:
-    agrees, differs (with the measured reason), undecided (the interval is partly inside and partly
+    Each row states the published value, the simulated one with its 95 % interval, and a verdict. The
+    verdicts are agrees, differs (with the measured reason), undecided (the interval is partly inside and partly
     outside the accepted range), or cannot be computed. The exit status is 1 if a published result differs.
     """
     from hydrotele.cli.experiments_command import experiments_to_folder

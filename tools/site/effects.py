@@ -49,13 +49,15 @@ def format_page(effect: Effect) -> str:
     )
     given = ", ".join(f"{key}: {value:.4g}" for key, value in picture.values.items())
     title = TITLES[effect.model_part]
+    changed = "".join(f" --set '{key}={value}'" for key, value in picture.overrides)
+    source = setting["source"].replace("`models/cat215/README.md`", "[CAT 215](../machines/cat215.md)")
     parts = [
         f"# {effect.name}",
         f"{effect.description[0].upper()}{effect.description[1:]}. This effect belongs to the group"
-        f" [{title}](index.md#{title.lower().replace(' ', '-')}); the index explains what an effect is for.",
+        f" [{title}](index.md#{title.lower().replace(' ', '-')}). [Effects](index.md) explains the use of effects.",
         "## Equation",
         f"$$\n{setting['equation']}\n$$",
-        f"{setting['symbols']} Source: {setting['source']}.",
+        f"{setting['symbols']} Source: {source}.",
         f"Valid values of `location` on the machine `{machine.name}`: {places}.",
         "## Parameters",
         f"Each row is a parameter, with the values for the location `{picture.location}` of `{machine.name}`; other"
@@ -64,14 +66,15 @@ def format_page(effect: Effect) -> str:
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |\n" + "\n".join(rows),
         (inspect.getdoc(effect.parameters) or "").partition("\n\n")[2].replace("\n\n", "\n"),
         "## Example",
-        f"The picture compares two simulations of the scenario `{picture.scenario}` with the same commands and with"
-        f" sensors without errors. The effect changes {sizes}. Wide pale lines: without the effect. Thin"
-        f" lines: with it. Right column: the signal with the effect minus that without it.",
+        f"The picture compares two simulations of the scenario `{picture.scenario}` (machine `{machine.name}`) with the"
+        f" same commands and with sensors without errors. The effect at `{picture.location}` changes {sizes}."
+        " Wide pale lines: without the effect. Thin lines: with it. Right column: the signal with the effect minus that"
+        " without it.",
         f"![Signals with and without {effect.name}]({effect.name}.png)",
         setting["shows"],
         "This command adds the effect to a run. Where a controller generates the commands of the scenario, it reacts"
         " to the effect, and the signals differ from those of the picture.",
-        f"```bash\nhydrotele run {picture.scenario} --set 'effects=[{{name: "
+        f"```bash\nhydrotele run {picture.scenario}{changed} --set 'effects=[{{name: "
         f"{effect.name}, location: {picture.location},"
         f" parameters: {{{given}}}}}]'\n```",
         "## Similar effects",
@@ -139,7 +142,7 @@ def list_pages() -> dict[str, str]:
     ]
     for part, title in TITLES.items():
         rows = [f"| [{e.name}]({e.name}.md) | {e.description} |" for e in EFFECTS.values() if e.model_part == part]
-        parts += [f"## {title}", PART_TEXTS[part], "| effect | what it is |\n| --- | --- |\n" + "\n".join(rows)]
+        parts += [f"## {title}", PART_TEXTS[part], "| effect | meaning |\n| --- | --- |\n" + "\n".join(rows)]
     names = "\n".join(sorted(EFFECTS))
     parts.append(f"```{{toctree}}\n:hidden:\n\n{names}\n```")
     pages["effects/index.md"] = "\n\n".join(parts) + "\n"

@@ -19,8 +19,8 @@ LINK = re.compile(r"\]\((?!https?:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 
 INDEX = """# Reference
 
-Look up here what a key of a file, a column of a log, an effect, an option of a command or a function of the Python
-API means. The pages are generated from the program, so they describe the installed version.
+These pages define every key of a file, column of a log, effect, option of a command and function of the Python API.
+The pages are generated from the program, so they describe the installed version.
 
 | page | content |
 | --- | --- |
