@@ -71,7 +71,7 @@ MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc_
 ITEM = re.compile(r"- (?P<names>`\w+`(?:, `\w+`)*)(?P<unit> \[[^\]]*\](?: or \[[^\]]*\])?)?: (?P<text>.*)")
 UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
 STATED_UNIT = re.compile(rf"\s*{UNIT.replace('?P<unit>', '').replace('?P<other>', '')}")
-NOT_UNITS = ("low", "values", "mean", "x", "command_unit")
+NOT_UNITS = ("unit", "low", "values", "mean", "x", "command_unit")
 
 
 class Key(NamedTuple):
