@@ -52,8 +52,8 @@ contributing
 
 
 MODELS = {
-    "cat215": "Caterpillar 215, excavator with bucket (hydraulic)",
-    "cat325": "Caterpillar 325, feller-buncher and other tools (hydraulic)",
+    "cat215": "Caterpillar 215, excavator with bucket or log grapple (hydraulic)",
+    "cat325": "Caterpillar 325, feller-buncher: a machine that fells trees (hydraulic)",
     "ec20": "Volvo EC20, mini excavator (hydraulic)",
     "rig": "test rig: one cylinder that pushes a mass (hydraulic)",
     "calibrator": "CAT 215 with the external calibrator of Khoshzaban 1992",
