@@ -116,17 +116,18 @@ def list_pages() -> dict[str, str]:
     parts = [
         "# Effects",
         "An effect is a physical phenomenon that a machine may have and its model may omit, such as"
-        " leakage, friction or"
-        " a sensor offset. Each effect has a name, a location (an axis, a link or a sensor) and parameters. It is used"
+        " leakage, friction or a sensor offset. Each effect has a name, a location and parameters. It is used"
         " in three ways:",
         "- `hydrotele run` and a scenario file add effects to the simulated machine.\n"
         "- `hydrotele gap` compares a machine with measured logs and reports which effects, at which location and of"
         " which size, explain the difference.\n"
         "- The patched machine that `hydrotele gap` writes contains the effects it has found.",
+        "The location is the part of the machine that has the effect: an axis or its drive (`stick`), a chamber or its"
+        " transducer (`stick.head`), a link, the tool, the `base`, the `supply`, or `all`. Each page lists the valid"
+        " locations of one machine.",
         "`hydrotele list effects` prints these tables. [Custom effects](../../effects.md) shows how to add an effect.",
         "Each page gives the equation, the parameters with their ranges, a simulated example, and how to"
-        " distinguish the"
-        " effect from similar ones. Its quantities are those of one drive: a hydraulic cylinder, a hydraulic motor or a"
+        " distinguish the effect from similar ones. Its quantities are those of one drive: a hydraulic cylinder, a hydraulic motor or a"
         " force actuator, which moves one joint. `positive` and `negative` are the directions of the spool:"
         " positive feeds the head side of a cylinder or port A of a motor.",
         "## Columns of the parameter tables",
