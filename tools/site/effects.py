@@ -127,7 +127,8 @@ def list_pages() -> dict[str, str]:
         " locations of one machine.",
         "`hydrotele list effects` prints these tables. [Custom effects](../../effects.md) shows how to add an effect.",
         "Each page gives the equation, the parameters with their ranges, a simulated example, and how to"
-        " distinguish the effect from similar ones. Its quantities are those of one drive: a hydraulic cylinder, a hydraulic motor or a"
+        " distinguish the effect from similar ones. Its quantities are those of one drive: a hydraulic"
+        " cylinder, a hydraulic motor or a"
         " force actuator, which moves one joint. `positive` and `negative` are the directions of the spool:"
         " positive feeds the head side of a cylinder or port A of a motor.",
         "## Columns of the parameter tables",
