@@ -122,9 +122,9 @@ def list_pages() -> dict[str, str]:
         "- `hydrotele gap` compares a machine with measured logs and reports which effects, at which location and of"
         " which size, explain the difference.\n"
         "- The patched machine that `hydrotele gap` writes contains the effects it has found.",
-        "The location is the part of the machine that has the effect. It can be an axis or its drive (`stick`), a chamber"
-        " or its transducer (`stick.head`), a link, the tool, `base`, `supply` or `all`. Each page lists the valid"
-        " locations of one machine.",
+        "The location is the part of the machine that has the effect. It can be an axis or its drive (`stick`), a"
+        " chamber or its transducer (`stick.head`), a link, the tool, `base`, `supply` or `all`. Each page lists the"
+        " valid locations of one machine.",
         "`hydrotele list effects` prints these tables. [Custom effects](../../effects.md) shows how to add an effect.",
         "Each page gives the equation, the parameters with their ranges, a simulated example, and how to"
         " distinguish the effect from similar ones. Its quantities are those of one drive: a hydraulic"
