@@ -106,8 +106,9 @@ def report(results: list[dict[str, list[list[float]]]], cycles: int) -> str:
         "each log with sensor noise, and predicts the forces along another path, a circle of "
         f"{RADIUS:g} m radius; a shorter lap is faster. Cells are RMS errors over one lap, mean of "
         f"{len(results)} trials; smaller is better. The last column combines the drives: the geometric mean of "
-        "the error relative to the smallest error of that lap; 1 is best. \"Bias subtracted\": noise of the positions causes a bias of the identified "
-        "parameters; it is estimated by adding noise once more, and subtracted.",
+        "the error relative to the smallest error of that lap; 1 is best. \"Bias subtracted\": noise of the "
+        "positions causes a bias of the identified parameters; it is estimated by adding noise once more, and "
+        "subtracted.",
         "",
         "| lap [s] | processing | swing [N m] | boom [N] | stick [N] | all, relative to best |",
         "| ---: | --- | ---: | ---: | ---: | ---: |",
