@@ -80,7 +80,7 @@ def format_introduction(name: str, count: int, failures: int) -> list[str]:
         "  range; \"partly outside\" those whose intervals are partly inside.",
         "- Verdict: *differs* if at least one quantity is outside, or is not a finite number (`inf`, `nan`).",
         "- A row may differ in the comparison, too. Its fault then shows only that the fault does not make it agree.",
-        "- A quantity keeps its name from the comparison, also where it contradicts the fault; the fault then applies.",
+        "- The text of a quantity is that of the experiment without the fault; its value is that with the fault.",
         "- `inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
         " not exist in a repetition, or has no definition, because",
         "  the repetitions have no scatter. Very large numbers occur if the fault makes a scatter or a denominator"
