@@ -45,8 +45,8 @@ def _ways(name: str, asked) -> list[str]:
         f"The batch has {asked.batch} environments, "
         f"`Sync` {asked.loop}, `Async` {asked.processes}. `Physics alone` is MuJoCo's `mujoco.batch.Batch` "
         "with two threads on the same model and commands, without control, sensors and reward: a reference for "
-        "the simulation alone. It is no upper limit: the batched environments call `mj_step` in a loop of their own, "
-        "which may be faster than that of MuJoCo's batch. "
+        "the simulation alone. It is no upper limit: the batched environments do not use this class, and their "
+        "loop over `mj_step` may be faster. "
         "The last three columns are ratios; above 1 the first is faster.",
         "",
         "| control rate [Hz] | physics steps per call | batched, 2 threads | 1 thread | Sync "

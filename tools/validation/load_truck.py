@@ -53,7 +53,7 @@ CONCLUSION = """
 
 For a truck on the floor of the excavation next to the soil, the Caterpillar Performance Handbook
 ([edition 47, page 7-246](https://cld.bz/bookdata/S232Z0r/basic-html/page-575.html)) calls cycles of 10 to 17 s
-practical and states 15 to 20 s as typical. The 17.8 s of the filled trucks are slower than the practical and within the
+practical; 15 to 20 s are typical. The 17.8 s of the filled trucks are slower than the practical and within the
 typical cycles, because of:
 
 - Swing: both swings cover 2 x 1.6 rad at 0.6 rad/s, the rate of the joint servo (0.8 of the valve's rated flow).
