@@ -46,8 +46,8 @@ INTRODUCTION = (
     "singularity, where legs cannot hold the platform. Rotations are multiplied by the radius of the platform's "
     f"joints, {1e3 * RADIUS:g} mm, so that they have the unit of translations. [The map](palida_workspace.png) has "
     "three cuts through the home pose; in each, two coordinates vary and the others are those of the home pose. Light "
-    "is good and dark is singular (rotations by 90 deg about z). The white line is the workspace that leg strokes and hinges "
-    "allow; it contains the singular poses, too."
+    "is good and dark is singular (rotations by 90 deg about z). The white line is the workspace that leg strokes and "
+    "hinges allow; it contains the singular poses, too."
 )
 
 

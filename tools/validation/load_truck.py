@@ -44,7 +44,7 @@ soil, bank and start.
 The trench and the load in the truck after five bucket loads.
 
 Each row is a kind of soil (`sandy_loam` is the loamy soil); "all" includes the trucks that were not filled. Force on
-the truck: contact force of the bucket, without the weight of the soil. Loads: bucket loads in all episodes. Fill:
+the truck: contact force, without the weight of the soil. Loads: bucket loads in all episodes. Fill:
 volume of a load relative to the heaped bucket (0.91 m3). A larger return (sum of rewards) is better.
 
 """
