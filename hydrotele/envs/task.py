@@ -125,8 +125,9 @@ class Options:
         effects: effects added to the machine in every episode: mappings with `name`, `location`, `parameters`.
         randomise: effects with a range [low, high] for each parameter, from which every variant gets a random value;
             or the result folder of `hydrotele gap`, of whose posterior every variant is one sample; or a list of both.
-        variants: number of random machines and start positions; every episode uses one of them.
-        variant_seed: random seed of the variants.
+        variants: number of variants, which are drawn once. A variant is a start position and, with `randomise`, a
+            random machine. The seed of `reset` selects one for each episode.
+        variant_seed: random seed of the variants; another value gives other variants.
         timestep: physics step [s].
         servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
             `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
