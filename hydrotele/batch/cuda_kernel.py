@@ -16,7 +16,7 @@ from hydrotele.batch import machine_step
 from hydrotele.batch.machine_step import Machines, Noise, Timing
 from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode, trace_mechanism
 from hydrotele.core.compiled import cache_folder, source_digest
-from hydrotele.core.device import import_cuda, make_device_function
+from hydrotele.core.device import import_cuda, is_simulated, make_device_function
 from hydrotele.core.output import atomic_file
 from hydrotele.core.tracing import make_device_program
 from hydrotele.estimate.reduced_model import Model
@@ -63,25 +63,50 @@ def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Te
     head = ["def kernel(model, machines, noise, timing, task, periods, source):", "    i = cuda.grid(1)"]
     head += ["    if i < machines.state.shape[0]:"]
     text = "\n".join([*head, *(f"        {line}" for line in body), ""])  # local arrays have constant sizes
-    path = _store_source(text, code, task, terms)
+    parts = [getattr(code, name).digest for name in PROGRAMS]
+    parts += [repr([term.law for term in terms]), str([law_index(term.law) for term in terms])]
+    laws = [LAWS[term.law].function.__module__ for term in terms]
+    return _jit_kernel(text, scope, (task.before, task.after), laws, parts), code.parameters
+
+
+def make_element_kernel(function: Any) -> Any:
+    """Return a CUDA kernel that calls `function(*arguments, k)` for each element k of its last array argument."""
+    code = getattr(function, "py_func", function).__code__
+    *names, last, _ = code.co_varnames[: code.co_argcount]
+    text = f"def kernel({', '.join([*names, last])}):\n    k = cuda.grid(1)\n"
+    text += f"    if k < {last}.shape[0]:\n        run_element({', '.join([*names, last])}, k)\n"
+    scope = {"cuda": import_cuda(), "run_element": make_device_function(function, {})}
+    return _jit_kernel(text, scope, (function,))
+
+
+def _jit_kernel(
+    text: str, scope: dict[str, Any], functions: Sequence[Any], modules: Sequence[str] = (), parts: Sequence[str] = ()
+) -> Any:
+    """Return the CUDA kernel with the name `kernel` of a source text, to be stored in the cache folder if possible.
+
+    Args:
+        text: source of the kernel.
+        scope: its global variables.
+        functions: compiled functions that it calls, besides those of this package's batch.
+        modules: names of further modules on whose source the code depends.
+        parts: further texts that change with the code.
+    """
+    path = _store_source(text, functions, modules, parts)
     exec(compile(text, path or "<kernel of a batch>", "exec"), scope)
-    return cuda.jit(scope["kernel"], cache=path is not None), code.parameters
+    return import_cuda().jit(scope["kernel"], cache=path is not None)
 
 
-def _store_source(text: str, code: MechanismCode, task: Any, terms: Sequence[Term]) -> str | None:
+def _store_source(text: str, functions: Sequence[Any], modules: Sequence[str], parts: Sequence[str]) -> str | None:
     """Write the source of a kernel to the cache folder and return its path; numba-cuda stores the code next to it.
 
-    The name of the folder depends on all that the code depends on. Returns None, for no cache, with laws or tasks
-    of other packages or without a cache folder.
+    The name of the folder depends on all that the code depends on; the arguments are those of `_jit_kernel`. Returns
+    None, for no cache, with laws or tasks of other packages or without a cache folder.
     """
-    modules = [__name__, *(f.py_func.__module__ for f in (task.before, task.after))]
-    modules += [LAWS[term.law].function.__module__ for term in terms]
+    modules = [__name__, *(f.py_func.__module__ for f in functions), *modules]
     folder = cache_folder()
     if folder is None or any(module.partition(".")[0] != "hydrotele" for module in modules):
         return None
-    parts = [text, *map(source_digest, modules), *(getattr(code, name).digest for name in PROGRAMS)]
-    parts += [f.py_func.__qualname__ for f in (task.before, task.after)] + [repr([term.law for term in terms])]
-    parts += [str([law_index(term.law) for term in terms])]
+    parts = [text, *map(source_digest, modules), *parts, *(f.py_func.__qualname__ for f in functions)]
     path = folder / f"cuda_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}" / "kernel.py"
     try:
         path.parent.mkdir(mode=0o700, exist_ok=True)
@@ -112,11 +137,19 @@ class CudaRunner:
         self._cuda = import_cuda()
         self._kernel, parameters = make_cuda_kernel(model, stacked, task, terms)
         self._parameters = self._copy_to_device(parameters)
+        self._element_kernels: dict[Any, Any] = {}
 
     def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
         """Launch the kernel; the call does not wait for its end."""
         blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
         self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods, self._parameters)
+
+    def launch(self, function: Any, *arguments: Any) -> None:
+        """Run a function for each element of its last array; the call does not wait for its end."""
+        if function not in self._element_kernels:
+            self._element_kernels[function] = make_element_kernel(function)
+        blocks = (len(arguments[-1]) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
+        self._element_kernels[function][blocks, THREADS_PER_BLOCK](*map(self.upload, arguments))
 
     def synchronise(self) -> None:
         """Wait until the device has done all launched kernels."""
@@ -132,14 +165,16 @@ class CudaRunner:
         if array.size == 0:
             whole = self._cuda.to_device(np.zeros(tuple(max(1, size) for size in array.shape), array.dtype))
             return whole[tuple(slice(size) for size in array.shape)]
-        return self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+        copy = self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+        return copy.view(np.recarray) if array.dtype.names and is_simulated() else copy  # for fields as attributes
 
     def assign(self, array: Any, values: Any) -> None:
         """Copy values of the CPU or of the device into an array of the device."""
         if hasattr(values, "__cuda_array_interface__"):
             _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
         else:
-            array.copy_to_device(np.asfortranarray(np.broadcast_to(np.asarray(values, array.dtype), array.shape)))
+            whole = np.broadcast_to(np.asarray(values, array.dtype), array.shape)
+            array.copy_to_device(np.asfortranarray(whole) if len(whole) > 1 else np.ascontiguousarray(whole))
 
     def assign_rows(self, array: Any, rows: np.ndarray, values: Any) -> None:
         """Copy values of the CPU into some rows of an array of the device."""

@@ -225,6 +225,13 @@ def restart_machine(model, sp, z, machines, i, start):
     """
     for k in range(len(z)):
         z[k] = machines.start[start, k]
+    restart_history(machines, i, start)
+    load_linkage(model.mech.dependent, sp.motion.joint, sp.motion.basis, machines.linkage[i])
+
+
+@compile_without_allocation
+def restart_history(machines, i, start):
+    """Set all of machine i but its state to a start state; see `restart_machine`."""
     for k in range(machines.linkage.shape[1]):
         machines.linkage[i, k] = machines.start_linkage[start, k]
     for row in range(machines.history.shape[1]):
@@ -233,7 +240,6 @@ def restart_machine(model, sp, z, machines, i, start):
     for c in range(machines.error.shape[1]):
         machines.error[i, c] = 0.0
     machines.period_count[i], machines.failed[i] = 0, 0
-    load_linkage(model.mech.dependent, sp.motion.joint, sp.motion.basis, machines.linkage[i])
 
 
 @compile_without_allocation
