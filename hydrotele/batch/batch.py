@@ -84,6 +84,7 @@ class Batch:
         state_names: names of the n states.
         machines: state of all machines; arrays of the device.
         model: Model with one row of parameters, or one per machine; arrays of the device.
+        task: the task.
         task_arrays: arrays of the task; arrays of the device.
     """
 
@@ -124,7 +125,7 @@ class Batch:
         self.axes, self.state_names = tuple(actuator_order(self.machine)), state_names(self.machine)
         models = [reduced_model(variant, self.channels) for variant in variants]
         _require_equal_structure(models, self.channels)
-        self._single, self._task = models[0], task
+        self._single, self.task = models[0], task
         self.model: Any = _stack_models(models, count)
         self._timing = _make_timing(self._single, period, timestep, rate_limit)
         self._noise = _make_noise(self.machine, sensors, self.channels, period)

@@ -172,6 +172,8 @@ class CudaRunner:
         """Copy values of the CPU or of the device into an array of the device."""
         if hasattr(values, "__cuda_array_interface__"):
             _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
+        elif is_simulated():
+            array[...] = values
         else:
             whole = np.broadcast_to(np.asarray(values, array.dtype), array.shape)
             array.copy_to_device(np.asfortranarray(whole) if len(whole) > 1 else np.ascontiguousarray(whole))

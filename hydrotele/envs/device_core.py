@@ -61,6 +61,11 @@ class DeviceCore(ReducedCore):
         self.batch.assign(self.action, action)
         self.batch.step(None, self.setup.clock.ticks)
 
+    def set_difficulty(self, difficulty: float) -> None:
+        """Set the size of the goals of new episodes on the device."""
+        super().set_difficulty(difficulty)
+        self.batch.assign(self.batch.task_arrays.parameters, self.parameters.reshape(1))
+
     def _run_call(self, call: int, chosen: np.ndarray | None) -> None:
         """Raise RuntimeError: `reset` and `step` launch kernels themselves."""
         raise RuntimeError(f"call {'reset' if call == RESET else 'step'}")

@@ -206,6 +206,10 @@ class TaskCore:
         names = ("r", "theta", "z", "attitude", "head")[: setup.arm_axes]
         return (*names, *setup.axes[setup.arm_axes :])
 
+    def set_difficulty(self, difficulty: float) -> None:
+        """Set the size of the goals of new episodes, see `difficulty` of `envs.task.Options`."""
+        self.parameters["difficulty"] = difficulty
+
     @property
     def bytes_per_environment(self) -> int:
         """Memory per environment: simulation state, episode record and results [byte]."""
