@@ -90,7 +90,9 @@ def format_markdown(rows: Sequence[Comparison], series: Series) -> str:
     lines = _table([row for row in rows if row.kind != "input"])
     inputs = [row for row in rows if row.kind == "input"]
     if inputs:
-        lines += ["", "## Published values used as inputs of the model", "", *_table(inputs)]
+        lines += ["", "## Published values used as inputs of the model", "",
+                  "The model was built from these values. The rows check that it contains them; they are not counted.",
+                  "", *_table(inputs)]  # fmt: skip
     if series.items_without_result:
         lines += ["", "## Tables and figures without a result", ""]
         lines += [f"- {item}: {content}" for item, content in series.items_without_result.items()]
@@ -99,14 +101,14 @@ def format_markdown(rows: Sequence[Comparison], series: Series) -> str:
 
 def _table(rows: Sequence[Comparison]) -> list[str]:
     lines = [
-        "| result | published | simulated [95 % interval] | verdict | criterion, reason |",
+        "| result (place in the document) | published | simulated [95 % interval] | verdict"
+        " | range that agrees (its source); explanation |",
         "| --- | --- | --- | --- | --- |",
     ]
     marks = {"additional": "; not in the publication", "caption": "; caption only"}
     for row in rows:
-        reason = ". ".join(part for part in (row.criterion, row.explanation) if part)
         cells = (f"{row.name} ({row.item}{marks.get(row.kind, '')})", row.published,
-                 row.simulated, row.verdict, reason)  # fmt: skip
+                 row.format_simulated_cell(), row.verdict, row.format_criterion_cell())  # fmt: skip
         lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
     return lines
 

@@ -328,9 +328,9 @@ GRADE = Task(
         " is locked; its action has no effect."
     ),
     reward=(
-        "The reward is 1 for every 0.01 m by which the RMS error of the profile decreases, minus"
-        " 0.05 per second. An error below 0.03 m for 1 s ends the episode with a reward of 5; an"
-        " edge 0.5 m below the plane ends it with -5."
+        "The reward is 1 for every 0.01 m by which the RMS error of the ground profile decreases, minus"
+        " 0.05 per second. An error below 0.03 m for 1 s ends the episode with an additional reward of 5 (success);"
+        " a bucket edge 0.5 m below the plane ends it with -5 (spoiled)."
     ),
     machine="cat215",
     tool="bucket",

@@ -256,8 +256,8 @@ HOLD_FORCE = Task(
         " stiffness. The reference force is between 10 and 35 kN and changes once."
     ),
     reward=(
-        "The reward is 1 minus the relative force error, at least -1; without contact it is 0. A"
-        " force above 100 kN, or a tip that is no longer over the plate, ends the episode with a"
+        "The reward of a step is 1 minus the force error relative to the reference force, at least -1; without"
+        " contact it is 0. A force above 100 kN, or a tip that is no longer over the plate, ends the episode with a"
         " reward of -50."
     ),
     machine="cat215",

@@ -492,16 +492,18 @@ _CYCLE_TASK = Task(
     description=(
         "An excavator fills a truck with soft, loamy or firm soil. It digs in a bank 0.5 to 1 m high, lifts the"
         " bucket, swings by 70 to 110 deg, dumps into the bed with walls 1.9 m high, and returns. The truck is full"
-        " with 5 m3 of loose soil. `phase` makes an episode of a single phase: `dig`, `haul`, `dump` or `return`."
+        " with 5 m3 of loose soil. An episode is the whole work (`phase=\"cycle\"`, the default) or a single phase:"
+        " `dig`, `haul`, `dump` or `return`."
     ),
     reward=(
         "The reward is 10 per m3 in the truck. Every m3 spilled costs 10, every MJ of hydraulic energy 1, every"
-        " second 0.1, and every 10 kN s of force on the truck 1. The change of a potential is added. A m3 in the"
-        " bucket has the potential 3, which rises to 7 above the truck; an empty bucket has -2 far from the bank"
-        " and 0 at it. Success ends the episode with 10. In `cycle` it is a full truck, in `dig` 0.45 m3 lifted 0.3"
-        " m above the bank. In `haul` it is the bucket above the bed with 80 % of its load, in `dump` an empty"
-        " bucket with 80 % of the load in the truck. In `return` it is the edge above the bank. A force above 100 kN"
-        " on the truck ends the episode with -20."
+        " second 0.1, and every 10 kN s of force on the truck 1. In addition, the change of a potential rewards"
+        " progress. Each m3 in the bucket has the potential 3, which rises to 7 above the truck. An empty"
+        " bucket has -2 far from the bank and 0 at the bank. Success ends the episode with an additional reward of"
+        " 10. In `cycle`, success is a full truck; in `dig`, it is 0.45 m3 in the bucket, lifted 0.3 m above the bank."
+        " In `haul`, it is the bucket above the bed with 80 % of its load; in `dump`, an empty bucket with 80 % of its"
+        " load in the truck; in `return`, the bucket edge above the bank. A force above 100 kN on the truck ends the"
+        " episode with -20."
     ),
     machine="cat215",
     tool="bucket",

@@ -466,11 +466,11 @@ PLACE_LOG = Task(
     ),
     reward=(
         "The reward is 1 for every metre that the log approaches its goal; 1 rad of yaw error"
-        " counts as 1 m. It is also 1 for every metre that the grapple approaches a log not yet held;"
-        " 1 rad of misalignment counts as 0.5 m. The first grip pays 5. Every step costs 0.005,"
-        " and 0.02 per radian between the grapple and the vertical. A released log that has lain"
-        " within 0.3 m and 15 deg of its goal for 0.5 s ends the episode with a reward of 20. A"
-        " log out of reach ends it with -20."
+        " counts as 1 m. While the log is not held, it is also 1 for every metre that the grapple approaches the log;"
+        " 1 rad of misalignment counts as 0.5 m. The first grip is worth 5. Every step costs 0.005,"
+        " and in addition 0.02 per radian between the grapple and the vertical. The episode ends with an additional"
+        " reward of 20 (success) when the released log has lain within 0.3 m and 15 deg of its goal for 0.5 s. It ends"
+        " with -20 if the log is out of reach."
     ),
     machine="cat215",
     tool="grapple_claw",

@@ -242,7 +242,7 @@ REACH_FELLER = Task(
     reward=(
         "The reward is 1 for every metre that the head approaches the pose (1 rad of attitude or"
         " head angle counts as 1 m), minus 0.01 per step. Holding the pose within 0.05 m and"
-        " 0.03 rad for 0.5 s ends the episode with a reward of 10."
+        " 0.03 rad for 0.5 s ends the episode with an additional reward of 10 (success)."
     ),
     machine="cat325",
     tool=None,

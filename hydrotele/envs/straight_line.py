@@ -335,8 +335,8 @@ STRAIGHT_LINE = Task(
         " with constant attitude."
     ),
     reward=(
-        "The reward is 1 minus 1 for every 0.1 m of cross-track error, every 0.2 m of along-track"
-        " error and every 0.2 rad of attitude error, at least -1."
+        "The reward of a step is 1 without error and at least -1. It decreases by 1 for every 0.1 m of error"
+        " perpendicular to the line, every 0.2 m along the line, and every 0.2 rad of attitude error."
     ),
     machine="cat215",
     tool="bucket",

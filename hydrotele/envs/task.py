@@ -122,22 +122,22 @@ class Options:
         control_rate: environment steps per second [Hz]; the servo runs at the multiple of this rate
             nearest to 200 Hz, or at this rate if it is higher.
         duration: duration of an episode [s].
-        effects: effects added to every episode: mappings with `name`, `location`, `parameters`.
-        randomise: effects with a range [low, high] per parameter, drawn for every variant; or the result folder
-            of `hydrotele gap`, of whose posterior every variant is one sample; or a list of both.
-        variants: number of random machines and starts; every episode uses one of them.
-        variant_seed: seed for drawing the variants.
+        effects: effects added to the machine in every episode: mappings with `name`, `location`, `parameters`.
+        randomise: effects with a range [low, high] for each parameter, from which every variant gets a random value;
+            or the result folder of `hydrotele gap`, of whose posterior every variant is one sample; or a list of both.
+        variants: number of random machines and start positions; every episode uses one of them.
+        variant_seed: random seed of the variants.
         timestep: physics step [s].
         servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
             `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
         phase: phase of the task that an episode consists of, for a curriculum; only for tasks with phases
             (`LoadTruck`: `dig`, `haul`, `dump`, `return`, `cycle`).
-        shaping: discount factor gamma of the learner, at most 1; the reward of every step from state s to s'
-            then has the term gamma Phi(s') - Phi(s) in addition, with the task's potential Phi. It does
-            not change which policies are optimal for this gamma. 0 for the reward without it.
-        difficulty: size of the goals, at most 1 (those of the task): rates of references, length and speed
-            of lines, distance of poses; tolerances of poses are divided by it. For a curriculum.
-        start: positions of axes at the start of every episode [rad] or [m]; those of other axes are drawn.
+        shaping: discount factor gamma of the learner, at most 1. The reward of every step from state s to s'
+            then has the additional term gamma Phi(s') - Phi(s), with the task's potential Phi. It does
+            not change which policies are optimal for this gamma. 0: no additional term.
+        difficulty: size of the goals, at most 1 (full size), for a curriculum. It multiplies rates of references,
+            length and speed of lines and distance of poses; tolerances of poses are divided by it.
+        start: positions of axes at the start of every episode [rad] or [m]; those of other axes are random.
     """
 
     machine: str | Path | Machine | None = None

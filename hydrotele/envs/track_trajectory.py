@@ -239,8 +239,8 @@ def _sample_start_positions(machine: Machine, rng: np.random.Generator) -> dict[
 TRACK_TRAJECTORY = Task(
     name="TrackTrajectory",
     kind="track",
-    description="All axes of an excavator without a tool track Fourier references.",
-    reward="The reward is 1 minus 1 for every 0.1 m of tip error, at least -1.",
+    description="All axes of an excavator without a tool follow periodic references, sums of three harmonics.",
+    reward="The reward of a step is 1 without error and at least -1. It decreases by 1 for every 0.1 m of tip error.",
     machine="cat215",
     tool="none",
     start=_sample_start_positions,

@@ -261,12 +261,15 @@ def evaluate_designed_excitation(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (
             check_bootstrapped_statistic(
-                "standard deviations with random motions over those with the designed one",
+                "standard deviations of the parameters with random motions over those with the designed "
+                "motion",
                 collect_values(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
                 (1.0, np.inf), "the designed motion is more precise"),
-            check_deterministic_value("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
+            check_deterministic_value("use of the tightest limit", samples[0].values["use"], (0.0, 1.0),
+                                      "within all limits, equation (25)"),
         ),
-        note=f"ln det of the information {samples[0].values['designed']:.1f}; of the best random"
+        note="logarithm of the determinant of the information matrix"
+        f" {samples[0].values['designed']:.1f}; of the best random"
         f" motion {collect_values(samples, 'random').max():.1f}",
     )  # fmt: skip
 
@@ -369,14 +372,14 @@ def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation
     return Evaluation(
         (
             check_mean(
-                "error of linear control at the highest speed over that at the lowest",
+                "RMS error of linear control at the highest speed over that at the lowest speed",
                 collect_values(samples, f"{path} growth"), (1.5, np.inf),
                 '"significant decreasing accuracy": at least 1.5 times the error'),
             check_mean(
-                "largest error with the nominal model over that of linear control",
+                "error with the nominal model over that of linear control, largest of all speeds",
                 collect_values(samples, f"{path} nominal"), (0.0, 1.0), '"improves always"'),
             check_mean(
-                "largest error with the identified over that with the nominal model",
+                "error with the identified model over that with the nominal model, largest of all speeds",
                 collect_values(samples, f"{path} identified"), (0.0, 0.8),
                 '"outperforms clearly": by a fifth of the error, at every speed'),
         ),

@@ -407,7 +407,7 @@ STRUCTURE = Experiment(
             ' contains therefore 14 different parameters."',
             "Table 1, section 5.1", "document", evaluate_table_1,
             {"declare_symmetry": False},
-            "no inertial parameter and no viscous friction of passive hinges is declared absent", (),
+            "no inertial parameter and no viscous friction of the passive hinges is assumed to be zero", (),
         ),
         Claim(
             "regrouping rules",
@@ -417,7 +417,7 @@ STRUCTURE = Experiment(
             " terminal bodies can be grouped to the inertial parameter of the platform according to"
             " Steiner's laws.\"",
             "section 2.1, (9) to (11)", "document", evaluate_regrouping_rules,
-            {"platform_rule": False}, "the rule for the platform is not applied",
+            {"platform_rule": False}, "the regrouping rule for the platform is not applied",
         ),
         Claim(
             "parameters of the model",

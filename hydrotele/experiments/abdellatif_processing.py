@@ -243,7 +243,7 @@ def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
     """
     checks = tuple(
         check_bootstrapped_statistic(
-            f"error variance, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
+            f"error variance of the predicted force, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
             collect_values(samples, f"{one} variance") / collect_values(samples, f"{other} variance"),
             lambda ratios: float(np.exp(np.mean(np.log(ratios)))), (0.0, 1.0),
             "smaller")
@@ -267,7 +267,7 @@ PROCESSING = Experiment(
             '"The effectiveness of the proposed filter is obvious, since the calculated signals'
             ' exhibit almost no noise or disturbance corruption."',
             "Fig. 6, section 5.2", "document", evaluate_reconstruction,
-            {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
+            {"harmonics": 200}, "the frequency filter keeps 200 instead of 5 harmonics",
             (*(f"amplitude of {label}" for label in (*_DERIVATIVE_LABELS, "force of drive 5 [N]")),
             *_DERIVATIVE_LABELS),
         ),
@@ -277,7 +277,7 @@ PROCESSING = Experiment(
             ' the smallest error variance σ2 . Time-domain filtering is not accurate enough to'
             ' extract all information at the relevant frequencies."',
             "Fig. 7, section 5.2", "document", evaluate_prediction,
-            {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
+            {"harmonics": 200}, "the frequency filter keeps 200 instead of 5 harmonics",
             tuple(f"force of drive 5, {words} [N]" for words in METHOD_NAMES.values()),
         ),
     ),

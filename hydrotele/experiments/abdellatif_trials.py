@@ -585,7 +585,7 @@ ENCODER_FEEDBACK = Experiment(
             "controllers feed encoder noise back into the forces; least squares and"
             " Gauss-Markov on samples are then biased, the frequency-domain processing is not",
             "section 3, after (21)", "additional", evaluate_bias_by_encoder_feedback,
-            {"length_noise": 0.001}, "encoders without noise", (),
+            {"length_noise": 0.001}, "the encoders have no noise", (),
         ),
     ),
     max_repetitions=20,

@@ -113,10 +113,10 @@ class Check(NamedTuple):
         """Return the quantity, its value, its confidence interval and the published value as text.
 
         >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "", published=11.0).describe()
-        'ratio 1.52 [1.31, 1.8] (published 11)'
+        'ratio = 1.52 [1.31, 1.8] (published 11)'
         """
         unit = f" {self.unit}" if self.unit else ""
-        text = f"{self.quantity} {_format_value(self.value)}"
+        text = f"{self.quantity} = {_format_value(self.value)}"
         if self.low < self.high:
             text += f" [{_format_value(self.low)}, {_format_value(self.high)}]"
         published = "" if self.published is None else f" (published {_format_value(self.published)})"
@@ -128,18 +128,41 @@ class Check(NamedTuple):
         >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "half of 11").describe_range()
         'ratio at least 5: half of 11'
         """
-        (least, most), unit = self.accepted, f" {self.unit}" if self.unit else ""
-        if np.isinf(most):
-            words = f"at least {_format_value(least)}"
-        elif np.isinf(least):
-            words = f"at most {_format_value(most)}"
+        return f"{self.quantity} {self.format_range()}" + (f": {self.reason}" if self.reason else "")
+
+    def format_range(self) -> str:
+        """Return the accepted range with its unit as text; one value if both ends print alike.
+
+        >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "half of 11").format_range()
+        'at least 5'
+        >>> Check("mass", 688.2, 688.2, 688.2, (687.5, 688.5), "last printed digit", "kg").format_range()
+        '688 kg'
+        """
+        least, most = (_format_value(end) for end in self.accepted)
+        if np.isinf(self.accepted[1]):
+            words = f"at least {least}"
+        elif np.isinf(self.accepted[0]):
+            words = f"at most {most}"
         else:
-            words = f"{_format_value(least)} to {_format_value(most)}"
-        return f"{self.quantity} {words}{unit}" + (f": {self.reason}" if self.reason else "")
+            words = least if least == most else f"{least} to {most}"
+        return f"{words} {self.unit}" if self.unit else words
 
 
 def _format_value(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1e3 or np.isinf(value) else f"{value:.0f}"
+
+
+def _list_numbers(numbers: Sequence[int]) -> str:
+    """Return numbers of checks as text; three or more consecutive ones as a range, such as `(1) to (3), (5)`."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(
+        f"({run[0]}) to ({run[-1]})" if len(run) > 2 else ", ".join(f"({number})" for number in run) for run in runs
+    )
 
 
 class Evaluation(NamedTuple):
@@ -218,6 +241,42 @@ class Comparison(NamedTuple):
         The latter is the measured reason for a difference, or the conditions of the agreement.
         """
         return self.evaluation.unavailable or self.evaluation.explanation
+
+    def format_simulated_cell(self) -> str:
+        """Return the simulated values as a cell of a Markdown table, with one numbered line per check."""
+        checks = self.evaluation.checks
+        lines = [
+            f"({number}) {check.describe()}" if len(checks) > 1 else check.describe()
+            for number, check in enumerate(checks, 1)
+        ]
+        if self.evaluation.note:
+            lines.append(f"In addition: {self.evaluation.note}" if lines else self.evaluation.note)
+        return "<br>".join(lines)
+
+    def format_criterion_cell(self, only_ranges: bool = False) -> str:
+        """Return the accepted ranges and the explanation as a cell of a Markdown table.
+
+        The numbers are those of `format_simulated_cell`. Checks with the same range share a line. With
+        `only_ranges`, the sources of the ranges and the explanation are omitted.
+        """
+        if self.evaluation.unavailable:
+            return self.evaluation.unavailable
+        checks = self.evaluation.checks
+        shared: dict[tuple[str, str], list[int]] = {}
+        for number, check in enumerate(checks, 1):
+            shared.setdefault((check.format_range(), "" if only_ranges else check.reason), []).append(number)
+        lines = [
+            (f"{_list_numbers(numbers)}: " if len(checks) > 1 else "") + words + (f" ({reason})" if reason else "")
+            for (words, reason), numbers in shared.items()
+        ]
+        found = {verdict: [number for number, check in enumerate(checks, 1) if check.verdict == verdict]
+                 for verdict in ("differs", "undecided")}  # fmt: skip
+        if len(checks) > 1 and self.verdict in found:
+            lines.append(". ".join(f"{label}: {_list_numbers(numbers)}" for label, numbers in zip(
+                ("Outside", "Partly outside"), found.values(), strict=True) if numbers))  # fmt: skip
+        if self.evaluation.explanation and not only_ranges:
+            lines.append(f"{'Reason' if self.verdict in found else 'Note'}: {self.evaluation.explanation}")
+        return "<br>".join(lines)
 
     def row(self) -> dict[str, Any]:
         """Return the row of the result table as a dictionary, as printed with `--json`, without curves."""

@@ -305,7 +305,7 @@ def check_d0_error_is_largest(samples: Sequence[Sample], case: str) -> Check:
     leads = [abs(s.values[f"{case}.error.p_z.swing"]) >= s.values[f"{case}.largest"]
              for s in samples]  # fmt: skip
     return check_fraction(
-        "trajectories in which d0 has the largest error", leads, MAJORITY_RANGE,
+        "fraction of the trajectories in which d0 has the largest error", leads, MAJORITY_RANGE,
         "more than half of the trajectories; the publication had one",
     )  # fmt: skip
 
@@ -343,8 +343,8 @@ def check_rms_ratio(
 
 
 A3_ERROR_REASON = (
-    "a3 is identified first; its error depends only on the boom's drift in the stick's stage, of"
-    " which Fig. 16(b) gives only the size"
+    "the length a3 is identified first, and its error depends only on the boom's drift while the stick"
+    " moves; Fig. 16(b) gives only the size of this drift"
 )
 
 
@@ -380,8 +380,8 @@ def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
         compute_rms(PUBLISHED_TWISTS["sensor"]), "deg",
     )  # fmt: skip
     proportion = check_rms_ratio(
-        "alpha and beta errors of links 2 and 3, sensors within 0.1 deg over 0.05 deg", samples,
-        ("sensor.outer", "half.outer"), (1.5, 2.5), "proportional is 2, within a quarter", 2.0,
+        "alpha and beta errors of links 2 and 3: with sensors within 0.1 deg over those with 0.05 deg", samples,
+        ("sensor.outer", "half.outer"), (1.5, 2.5), "2 is proportional; tolerance 25 %", 2.0,
     )  # fmt: skip
     return Evaluation(
         (
@@ -410,9 +410,9 @@ def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
     a2, a3 = (abs(find_published_error("flexible", n)) for n in ("a.boom", "a.stick"))
     checks = (
         check_rms_ratio(
-            "largest length error over that with sensors and drift", samples,
+            "largest length error over that with drift and sensors of 0.1 deg", samples,
             ("flexible.largest", "sensor.largest"), (0.5 * ratio, 2.0 * ratio),
-            "a factor of 2 around a single sample of errors", ratio,
+            "a factor of 2 around the published ratio, which is of a single run", ratio,
         ),
         check_published_in_population("RMS error of the lengths", 1e3 * collect_values(samples, "flexible.lengths"),
                          1e3 * lengths, "mm"),
@@ -422,7 +422,7 @@ def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
         check_rms_ratio(
             "error of a2 over that of a3", samples,
             ("flexible.error.a.boom", "flexible.error.a.stick"), (0.5 * a2 / a3, np.inf),
-            "errors grow very rapidly from the last link to the first: at least half as much",
+            "at least half of the published ratio: errors grow \"very rapidly\" from the last link to the first",
             a2 / a3,
         ),
     )  # fmt: skip
@@ -445,9 +445,9 @@ def check_constant_bend_ratio(samples: Sequence[Sample]) -> Check:
     """
     ratio = 838.0 / 73.0
     return check_rms_ratio(
-        "the largest length error over that with sensors and drift", samples,
+        "the largest length error over that with drift and sensors of 0.1 deg", samples,
         ("lasting.largest", "sensor.largest"), (0.5 * ratio, 2.0 * ratio),
-        "a factor of 2 around a single sample of errors", ratio,
+        "a factor of 2 around the published ratio, which is of a single run", ratio,
     )  # fmt: skip
 
 
@@ -472,12 +472,12 @@ def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
     both = 100.0 * np.abs(collect_values(samples, "sensor.error.a.swing")) / size
     return Evaluation((
         check_bootstrapped_statistic(
-            "95 % limit (1.96 RMS) with 0.05 deg and no drift", half,
+            "95 % limit (1.96 times the RMS error) with sensors within 0.05 deg and no drift", half,
             lambda values: 1.96 * compute_rms(values), (1.25, 5.0),
-            "a factor of 2 around the maximum of an unknown number of runs", unit="%",
+            "a factor of 2: the published value is the maximum of an unknown number of runs", unit="%",
             published=2.5,
         ),
-        check_published_in_population("error with drift and 0.1 deg", both, 10.0, "%"),
+        check_published_in_population("error with drift and sensors of 0.1 deg", both, 10.0, "%"),
     ))  # fmt: skip
 
 
@@ -496,10 +496,11 @@ def evaluate_sensor_fraction_of_error(samples: Sequence[Sample]) -> Evaluation:
 
     alone = compute_rms(rows[:, 2]) / compute_rms(rows[:, 1])
     return Evaluation(
-        (check_bootstrapped_statistic("error of a1 by sensors of 0.1 deg over that with drift", rows,
-                         compute_sensor_fraction, (0.35, 0.65), "half, to one digit", published=0.5),),
+        (check_bootstrapped_statistic("error of a1 with sensors of 0.1 deg alone over that with these sensors and"
+                         " drift", rows, compute_sensor_fraction, (0.35, 0.65), "half, rounded to one digit",
+                         published=0.5),),
         f"drift alone causes {alone:.2f} times the error of both, so that the sensors contribute"
-        " little; by Tables 4 and 5, drift causes 34 of 42 mm",
+        " little. In Tables 4 and 5 of the thesis, too, drift alone causes 34 of the 42 mm",
     )  # fmt: skip
 
 
@@ -512,10 +513,10 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
     """
     totals = {case: sum(counts) for case, counts in PUBLISHED_ITERATIONS.items()}
     checks = []
-    for case in ("sensor", "flexible"):
+    for case, words in (("sensor", "sensor errors"), ("flexible", "flexible joints")):
         ratio = totals[case] / totals["drift"]
         checks.append(check_rms_ratio(
-            f"iterations, {case} over drift alone", samples, (f"{case}.total", "drift.total"),
+            f"iterations with drift and {words} over those with drift alone", samples, (f"{case}.total", "drift.total"),
             (1.0 + 0.5 * (ratio - 1.0), np.inf), "at least half of the published increase", ratio,
         ))  # fmt: skip
     most = [
@@ -523,15 +524,16 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
         for s in samples
         for case in totals
     ]
-    checks.append(check_fraction("calibrations in which link 2 needs most", most, MAJORITY_RANGE,
-                                 "more than half; in all three tables"))  # fmt: skip
-    words = [f"{case} " + ", ".join(f"{collect_values(samples, f'{case}.iterations.{link}').mean():.0f}"
+    checks.append(check_fraction("fraction of the calibrations in which link 2 needs most iterations", most,
+                                 MAJORITY_RANGE,
+                                 "more than half; in the thesis in all three tables"))  # fmt: skip
+    counts = [f"{case} " + ", ".join(f"{collect_values(samples, f'{case}.iterations.{link}').mean():.0f}"
                                     for link in SIMULATED_STAGES) for case in totals]  # fmt: skip
     return Evaluation(
         tuple(checks),
         "the solver omits small singular values with four decreasing thresholds and iterates at"
-        " each of them until it converges; with drift alone a link already needs 8 iterations or more",
-        f"links 3, 2 and 1: {'; '.join(words)}",
+        " each of them until it converges. A link therefore needs 8 or more iterations even with drift alone",
+        f"mean iterations of links 3, 2 and 1: {'; '.join(counts)}",
     )
 
 
@@ -547,7 +549,7 @@ def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_mean("fraction of the lengths with errors below 5 %", (errors < 0.05).mean(axis=1),
                     MAJORITY_RANGE, "usually: more than half"),),
-        note=f"RMS errors in %: {', '.join(rms)}; Table 5 itself has 3 of 6 below 5 %",
+        note=f"RMS errors in %: {', '.join(rms)}; in Table 5 of the thesis 3 of 6 lengths are below 5 %",
     )  # fmt: skip
 
 
@@ -557,7 +559,8 @@ def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
     Khoshzaban 1992 states this on pp. 62 and 121.
     """
     return Evaluation((
-        check_deterministic_value("largest difference of the results", float(collect_values(samples, "spread").max()),
+        check_deterministic_value("largest difference of an identified parameter between starts",
+                    float(collect_values(samples, "spread").max()),
                     (0.0, 5e-4), "half of the last printed digit of a length", unit="m or rad"),
     ))  # fmt: skip
 
@@ -573,8 +576,9 @@ def evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
 EXPERIMENTS = (
     Experiment("exact readings", measure_exact_readings, (
         Claim(
-            "readings without error", "every parameter is recovered", "section 3.7, p. 56",
-            "additional", evaluate_exact_readings, {"accuracy": 1e-6}, "sensor errors are within 1 urad",
+            "readings without error", "without sensor errors and drift, every parameter is identified exactly",
+            "section 3.7, p. 56", "additional", evaluate_exact_readings, {"accuracy": 1e-6},
+            "sensors have errors of up to 1 urad",
         ),
     ), fixed_repetitions=1),
     Experiment("simulated calibrations", measure_disturbance_effects, (
@@ -588,7 +592,7 @@ EXPERIMENTS = (
         Claim(
             "drift and sensors of 0.1 deg",
             '"the accuracy of the calibrator sensors proportionally altered" alpha and beta (0.1 to'
-            " 0.2 deg); d0 errs by 73 mm, a1 -42, a2 +19, a3 -4 mm",
+            " 0.2 deg); errors: d0 73 mm, a1 -42, a2 +19, a3 -4 mm",
             "Table 5, section 3.7.2, pp. 60-61", "document", evaluate_sensor_errors,
             {"drift": False}, "held links do not drift",
         ),
@@ -612,28 +616,28 @@ EXPERIMENTS = (
             '"one should expect a maximum relative error of 2.5% in a1" with sensors within 0.05'
             " deg; about 10 % with drift and 0.1 deg",
             "section 3.7.2, p. 60", "document", evaluate_relative_error,
-            {"accuracy": 10.0 * MAX_RESOLVER_ERROR}, "sensor errors are ten times as large",
+            {"accuracy": 10.0 * MAX_RESOLVER_ERROR}, "sensors have ten times the errors",
         ),
         Claim(
             "share of the sensors in the error of a1",
             '"about half of the error obtained here is due to the sensor accuracy"',
             "section 3.7.2, p. 60", "document", evaluate_sensor_fraction_of_error,
             {"accuracy": 0.1 * MAX_RESOLVER_ERROR},
-            "sensor errors are a tenth as large",
+            "sensors have a tenth of the errors",
         ),
         Claim(
             "iterations",
             '"the number of iterations required to identify the unknown parameters for a particular'
-            ' joint increases dramatically as the data gets noisier": 22, 27, 40 for links 3, 2 and'
-            " 1 together, link 2 needs most",
+            ' joint increases dramatically as the data gets noisier": 22 (drift), 27 (sensors), 40'
+            " (flexible joints) for links 3, 2 and 1 together; link 2 needs most",
             "Tables 4 to 6, section 3.7.3, p. 62", "document", evaluate_iterations,
-            {"accuracy": 0.0, "bend": 0.0}, "all three conditions have the same data",
+            {"accuracy": 0.0, "bend": 0.0}, "all three conditions have only drift, so that their data are the same",
         ),
         Claim(
             "errors with resolvers of 0.1 deg",
             '"errors in the identified parameters to be usually less than 5%"',
             "section 5.1, p. 122", "document", evaluate_all_relative_errors, {"accuracy": 50.0 * MAX_RESOLVER_ERROR},
-            "sensor errors are within 5 deg",
+            "sensors have errors of up to 5 instead of 0.1 deg",
         ),
     )),
     Experiment("first estimates", compare_initial_estimates, (
@@ -642,7 +646,7 @@ EXPERIMENTS = (
             '"A number of different initial conditions were tried, but the iterations always ended'
             ' up with the same results"',
             "section 3.8.1, p. 62; section 5.1, p. 121", "document", evaluate_initial_estimates,
-            {"length": 4.0, "angle": 90.0}, "starts up to 4 m and 90 deg from nominal",
+            {"length": 4.0, "angle": 90.0}, "first estimates are up to 4 m and 90 deg from nominal",
         ),
     ), max_repetitions=10),
 )  # fmt: skip

@@ -151,7 +151,7 @@ def evaluate_printed_end_point_errors(samples: Sequence[Sample]) -> Evaluation:
         for end, published in ends.items():
             table = 7 if model == "identified" else 9
             checks.append(check_deterministic_value(
-                f"{end}'s end, Table {table}, from the {side} side",
+                f"{end}'s end with the parameters of Table {table}, {side} side",
                 samples[0].values[f"{model}.{side}.{end}"],
                 (0.7 * published, 1.3 * published) if published else (0.0, 0.0005),
                 "30 %: a limit of this project, because the thesis' poses are unknown except for their ranges"
@@ -160,10 +160,10 @@ def evaluate_printed_end_point_errors(samples: Sequence[Sample]) -> Evaluation:
             ))  # fmt: skip
     return Evaluation(
         tuple(checks),
-        "Table 9's parameters are not closer to nominal in the sweep of any link: stick's end"
-        " 0.278, 0.299 and 0.268 m for stick, boom and swing; the error of the grapple's end is"
-        " zero, because relative to the ball it depends only on links 7 and 8, whose lengths are"
-        " fixed",
+        "the parameters of Table 9 do not move the stick's end closer to the nominal one, whichever link"
+        " moves: its error is 0.278, 0.299 and 0.268 m for stick, boom and swing. From the calibrator side, the error"
+        " of the grapple's end is zero, because its position relative to the ball depends only on"
+        " links 7 and 8, whose lengths are fixed",
     )
 
 
@@ -184,8 +184,8 @@ def evaluate_identified_parameter_errors(samples: Sequence[Sample]) -> Evaluatio
     )  # fmt: skip
     return Evaluation(
         checks,
-        "only the stick's stage has bent joints here (p. 69), so that the errors of links 4 and 5,"
-        " which are identified before, come only from sensor noise and drift; the thesis' offsets"
+        "in the simulation, joints bend only in the stage of the stick (p. 69). Links 4 and 5 are identified"
+        " before it, so that their errors come only from sensor noise and drift. The thesis' offsets"
         " of 8.6 and 4.2 deg are those of misaligned sensors. Bends of 6 to 12 deg instead of 2 to"
         " 6 deg cause errors of 81 mm and 4.8 deg in links 0 to 3",
         _describe_link_parameter_errors(samples, "identified"),
@@ -236,7 +236,10 @@ def _describe_link_parameter_errors(samples: Sequence[Sample], model: str) -> st
     for name, published in zip(TWIST_PARAMETERS, _PRINTED_TWISTS[model], strict=True):
         ours = np.degrees(collect_values(samples, f"{model}.error.{name}"))
         parts.append(f"{name} {ours.mean():.1f} +- {ours.std():.1f} ({published:.1f})")
-    return f"errors in mm and deg (published; d0, a0 as -d0, -a0): {', '.join(parts)}"
+    return (
+        "mean +- standard deviation of the errors in mm and deg (in parentheses the published error; d0 and a0 with"
+        f" reversed sign): {', '.join(parts)}"
+    )
 
 
 def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
@@ -251,7 +254,7 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
     for name in ("a.swing", "d.boom"):
         ratio = abs(after[name] / before[name])
         checks.append(check_rms_ratio(
-            f"error of {LENGTH_SYMBOLS[name]} over that of Table 7", samples,
+            f"error of {LENGTH_SYMBOLS[name]}, reidentified over identified", samples,
             (f"reidentified.error.{name}", f"identified.error.{name}"), compute_accepted_ratio_range(ratio),
             CHANGE_REASON, ratio,
         ))  # fmt: skip
@@ -259,7 +262,7 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
         ratio = _compute_printed_twist_rms("reidentified", kind) / _compute_printed_twist_rms("identified", kind)
         accepted = compute_accepted_ratio_range(ratio) if ratio < 1.0 else (1.0, np.inf)
         checks.append(check_rms_ratio(
-            f"error of {kind} over that of Table 7", samples,
+            f"error of {kind}, reidentified over identified", samples,
             (f"reidentified.{kind}", f"identified.{kind}"), accepted,
             CHANGE_REASON if ratio < 1.0 else "increased", ratio,
         ))  # fmt: skip
@@ -280,7 +283,7 @@ def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
     """
     return Evaluation(
         tuple(_check_link_parameter_errors(samples, "reidentified")),
-        "after the removal only sensor noise affects alpha and beta here; the thesis also names"
+        "after the bent poses are removed, only sensor noise affects alpha and beta here; the thesis also names"
         " sensor misalignment as a cause (p. 65), which is not simulated",
         _describe_link_parameter_errors(samples, "reidentified"),
     )
@@ -299,7 +302,7 @@ def _check_rms_errors(samples: Sequence[Sample], model: str, side: str, publishe
     `manipulator` or `calibrator`. `name` is the pattern of the result's name in the samples.
     """
     return [
-        check_published_in_population(f"{end}'s end, {model}, {side} side",
+        check_published_in_population(f"RMS error of the {end}'s end, {model} model, {side} side",
                          1e3 * collect_values(samples, name.format(model=model, side=side, end=end)),
                          1e3 * size, "mm")
         for end, size in published[model, side].items() if size
@@ -323,7 +326,7 @@ def _check_error_decrease(
         keys = tuple(name.format(model=model, side=side, end=end) for model in reversed(names))
         ratio = after / before
         checks.append(check_rms_ratio(
-            f"{end}'s end, {names[1]} over {names[0]}", samples, (keys[0], keys[1]),
+            f"error of the {end}'s end, {names[1]} over {names[0]} model", samples, (keys[0], keys[1]),
             compute_accepted_ratio_range(ratio), CHANGE_REASON, ratio,
         ))  # fmt: skip
     return checks
@@ -371,7 +374,7 @@ def evaluate_calibrator_end_points(samples: Sequence[Sample]) -> Evaluation:
         for check in _check_rms_errors(samples, model, "calibrator", PUBLISHED_POSITION_ERRORS, _POSITION_KEY)
     ]
     checks += [
-        check_deterministic_value(f"largest of the grapple's end, {model}",
+        check_deterministic_value(f"largest error of the grapple's end, {model} model",
                     float(collect_values(samples, f"{model}.position.calibrator.grapple").max()),
                     (0.0, 0.0005), "printed as 0.000", unit="m", published=0.0)
         for model in models
@@ -380,7 +383,7 @@ def evaluate_calibrator_end_points(samples: Sequence[Sample]) -> Evaluation:
     ratio = 0.373 / 0.542
     checks.append(
         check_rms_ratio(
-            "stick's end, reidentified over identified",
+            "error of the stick's end, reidentified over identified model",
             samples,
             (stick[0], stick[1]),
             compute_accepted_ratio_range(ratio),
@@ -410,8 +413,8 @@ def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
     ]
     return Evaluation(
         tuple(checks),
-        "the nominal machine is the true one here, so that the nominal model has only errors of"
-        " sensors and tape; if lengths differ by N(0, 20 mm) and angles by N(0, 0.7 deg) from"
+        "the simulated machine is the nominal one, so that the nominal model has only errors of"
+        " sensors and tape. If lengths differ by N(0, 20 mm) and angles by N(0, 0.7 deg) from"
         " nominal, its errors are 0.032 and 0.045 m, and those of the identified model 0.071 and"
         " 0.051 m",
         _describe_vaf(samples, "manipulator"),
@@ -432,18 +435,18 @@ def compare_nominal_and_identified_distances(samples: Sequence[Sample]) -> Evalu
             / PUBLISHED_DISTANCE_ERRORS["nominal", "manipulator"][end]
         )
         checks.append(check_rms_ratio(
-            f"{end}'s end, identified over nominal", samples,
+            f"error of the {end}'s end, identified over nominal model", samples,
             (f"identified.manipulator.{end}.rms", f"nominal.manipulator.{end}.rms"),
             (0.5 * ratio, 2.0 * ratio), "a factor of 2 around one measurement", ratio,
         ))  # fmt: skip
     checks.append(check_rms_ratio(
-        "stick's end, identified, more distant half of the poses over the closer half", samples,
+        "error of the stick's end, identified model, more distant half of the poses over the closer half", samples,
         ("identified.manipulator.stick.far", "identified.manipulator.stick.near"), (0.0, 1.0),
         "the error decreases when the manipulator stretches its arms",
     ))  # fmt: skip
     return Evaluation(
         tuple(checks),
-        "the nominal machine is the true one here; if lengths differ by N(0, 20 mm) and angles by"
+        "the simulated machine is the nominal one. If lengths differ by N(0, 20 mm) and angles by"
         " N(0, 0.7 deg) from nominal, the ratios are 2.2 and 1.1",
     )
 
@@ -472,14 +475,14 @@ def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
     ]
     stick = 0.021 / 0.026
     checks.append(check_rms_ratio(
-        "stick's end, identified over nominal", samples,
+        "error of the stick's end, identified over nominal model", samples,
         ("identified.calibrator.stick.rms", "nominal.calibrator.stick.rms"), compute_accepted_ratio_range(stick),
         CHANGE_REASON, stick,
     ))  # fmt: skip
     same = [abs(s.values["identified.calibrator.grapple.rms"]
                 - s.values["nominal.calibrator.grapple.rms"]) for s in samples]  # fmt: skip
-    checks.append(check_deterministic_value("grapple's end, largest difference of both models", max(same),
-                              (0.0, 0.0005), "printed with the same three digits", unit="m",
+    checks.append(check_deterministic_value("grapple's end, largest difference between the errors of both models",
+                              max(same), (0.0, 0.0005), "printed with the same three digits", unit="m",
                               published=0.0))  # fmt: skip
     return Evaluation(
         tuple(checks),
@@ -514,8 +517,8 @@ def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
     for end in END_POINT_LINKS:
         change = [abs(s.values[f"reidentified.calibrator.{end}.rms"]
                       - s.values[f"identified.calibrator.{end}.rms"]) for s in samples]  # fmt: skip
-        checks.append(check_deterministic_value(f"{end}'s end, calibrator side, largest change", max(change),
-                                  (0.0, 0.0005), "printed with the same three digits", unit="m",
+        checks.append(check_deterministic_value(f"error of the {end}'s end, calibrator side, largest change",
+                                  max(change), (0.0, 0.0005), "printed with the same three digits", unit="m",
                                   published=0.0))  # fmt: skip
     return Evaluation(tuple(checks))
 
@@ -530,16 +533,16 @@ def evaluate_predicted_readings(samples: Sequence[Sample]) -> Evaluation:
     checks = []
     for joint in (5, 6):
         checks.append(check_rms_ratio(
-            f"difference at joint {joint}, stick retracted over other poses", samples,
+            f"difference at joint {joint}: poses with retracted stick over other poses", samples,
             (f"inside.{joint}", f"outside.{joint}"), (2.0, np.inf),
-            "a large discrepancy there: at least twice",
+            "at least twice as large: \"a large discrepancy\"",
         ))  # fmt: skip
     for joint in (7, 8):
         rows = np.column_stack([collect_values(samples, f"inside.{k}") for k in (joint, 5, 6)])
         checks.append(check_bootstrapped_statistic(
-            f"difference at joint {joint} over the smaller one of joints 5 and 6, stick retracted",
+            f"difference at joint {joint} over the smaller one of joints 5 and 6, poses with retracted stick",
             rows, _compute_ratio_to_smaller_rms, (0.0, 0.5),
-            "good agreement against a large discrepancy: at most half",
+            "at most half of the large discrepancy: \"good agreement\"",
         ))  # fmt: skip
     sizes = ", ".join(f"{k}: {compute_rms(collect_values(samples, f'inside.{k}')):.2f} and"
                       f" {compute_rms(collect_values(samples, f'outside.{k}')):.2f}"
@@ -547,9 +550,9 @@ def evaluate_predicted_readings(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         tuple(checks),
         "the axes of joints 5 and 7 are nearly parallel when the yoke angle is near zero, so that"
-        " an error of one is predicted at the other; if only joint 6 bends, joint 7 differs by"
+        " an error of one appears in the prediction of the other. If only joint 6 bends, joint 7 differs by"
         " 0.12 deg",
-        f"RMS difference in deg, stick retracted and other poses, joint {sizes}",
+        f"RMS difference in deg with retracted stick and in other poses, joint {sizes}",
     )  # fmt: skip
 
 
@@ -568,8 +571,8 @@ def evaluate_bend_detection(samples: Sequence[Sample]) -> Evaluation:
     found = [s.values["overlap"] > 0.5 and s.values["blamed"] > 0.5 for s in samples]
     visible = collect_values(samples, "left out").mean()
     return Evaluation(
-        (check_fraction("calibrations in which the region and one of its joints are found", found,
-                        (0.9, 1.0), "nine of ten, as with errors of one joint"),),
+        (check_fraction("fraction of the calibrations in which the bent poses and one of the bent joints are found",
+                        found, (0.9, 1.0), "nine of ten, the limit for errors of one joint"),),
         "the parameters of the stage, identified from the same poses, absorb bends of two joints"
         f" that increase smoothly; the nominal model detects {100 * visible:.0f} % of the"
         " bent poses",
@@ -690,7 +693,8 @@ EXPERIMENTS = (
     Experiment("search for bent joints", measure_bend_detection, (
         Claim(
             "search for bent joints without an observer",
-            "the poses with bent joints and one of these joints are found by the equations alone",
+            "the closure equations alone, without an observer of the machine, identify the poses with bent joints and"
+            " one of these joints",
             "section 3.8.2, pp. 67-70", "additional", evaluate_bend_detection, {"bend": (0.0, 0.0)},
             "no joint bends", (),
         ),

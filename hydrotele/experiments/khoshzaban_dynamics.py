@@ -165,10 +165,10 @@ def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
     checks = (
         check_mean(
             "RMS difference of both models' forces, boom", rows[:, 0],
-            (SENSOR_ACCURACY[1], np.inf), "large: above the sensors' accuracy (p. 108)", unit="N",
+            (SENSOR_ACCURACY[1], np.inf), "above the sensors' accuracy (p. 108): large", unit="N",
         ),
         check_bootstrapped_statistic(
-            "the same, boom over stick", rows,
+            "RMS difference of the boom over that of the stick", rows,
             lambda r: float(np.linalg.norm(r[:, 0]) / max(np.linalg.norm(r[:, 1]), 1e-300)),
             (1.0, np.inf), "the proximal cylinder's error is larger",
         ),
@@ -228,6 +228,7 @@ COUNT_SETTINGS = {
     "tilt_deg": 0.0,  # slope of the ground
     "states": 300,  # number of random states in the regressor
 }
+_CLASS_NAMES = {"deleted": "unidentifiable", "combined": "linearly identifiable", "full": "fully identifiable"}
 TABLE_13 = {"deleted": 31, "combined": 24, "full": 27}
 """Unidentifiable, linearly identifiable and fully identifiable parameters of 82 (p. 107)."""
 
@@ -296,10 +297,8 @@ def evaluate_identifiability_counts(samples: Sequence[Sample]) -> Evaluation:
     These counts are those of Khoshzaban 1992, Table 13, for cylinders that end in ball joints.
     """
     values = samples[0].values
-    words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
-             "full": "fully identifiable"}  # fmt: skip
     checks = tuple(
-        check_deterministic_value(f"{words[name]} parameters", values[f"document.{name}"], (n, n),
+        check_deterministic_value(f"{_CLASS_NAMES[name]} parameters", values[f"document.{name}"], (n, n),
                     "a count", published=n)
         for name, n in TABLE_13.items()
     )  # fmt: skip
@@ -309,7 +308,7 @@ def evaluate_identifiability_counts(samples: Sequence[Sample]) -> Evaluation:
         "The counts hold for cylinders that transmit no moment about their axes (Eq. 4.23, ball"
         " joints). Cylinders with pins transmit this moment, so that six combinations of the tubes'"
         " and rods' parameters and the links' inertias cannot be separated.",
-        note=f"with pins {pins}; singular values on either side of the rank"
+        note=f"counts for cylinders with pins {pins}; smallest singular value within the rank and largest beyond it"
         f" {values['document.smallest']:.1g} and {values['document.next']:.0g} of the largest",
     )
 
@@ -323,7 +322,7 @@ def evaluate_counts_with_pin_joints(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation(
         tuple(
-            check_deterministic_value(f"{name} parameters", values[f"pins.{name}"], (n, n), "a count")
+            check_deterministic_value(f"{_CLASS_NAMES[name]} parameters", values[f"pins.{name}"], (n, n), "a count")
             for name, n in PIN_COUNTS.items()
         )
     )
@@ -340,10 +339,10 @@ def evaluate_swing_parameters(samples: Sequence[Sample]) -> Evaluation:
         (
             check_deterministic_value("parameters without effect", values["document.without_effect"], (9, 9),
                         "the first nine of the swing", published=9),
-            check_deterministic_value("they are the first nine of the swing",
-                        values["document.first_nine_lost"], (1, 1), "1: yes"),
-            check_deterministic_value("Izz of the swing is identifiable in a combination",
-                        values["document.swing_combined"], (1, 1), "1: yes"),
+            check_deterministic_value("these are the first nine of the swing (1: yes, 0: no)",
+                        values["document.first_nine_lost"], (1, 1), "yes"),
+            check_deterministic_value("Izz of the swing is identifiable only in a combination (1: yes, 0: no)",
+                        values["document.swing_combined"], (1, 1), "yes"),
         ),
     )  # fmt: skip
 

@@ -63,8 +63,8 @@ def _describe_angles(samples: Sequence[Sample]) -> str:
     boom, stick = (collect_values(samples, f"{axis}.angle").mean() for axis in ("boom", "stick"))
     return (
         f"the standard deviations of the errors of computed angles are {boom:.2f} deg (boom) and"
-        f" {stick:.2f} deg (stick) here;"
-        " 27 mm at the stick's lever of at most 0.72 m are 2.1 deg or more"
+        f" {stick:.2f} deg (stick) in the simulation;"
+        " the published 27 mm correspond to 2.1 deg or more, because the stick's lever is at most 0.72 m"
     )
 
 
@@ -103,7 +103,7 @@ def compare_measured_and_computed_angles(samples: Sequence[Sample]) -> Evaluatio
         ]
         checks.append(check_bootstrapped_statistic(
             f"error of the {axis}'s lengths from measured over that from computed angles", rows,
-            lambda r: compute_rms(r[:, 0]) / compute_rms(r[:, 1]), (0.0, 1.0), "closer",
+            lambda r: compute_rms(r[:, 0]) / compute_rms(r[:, 1]), (0.0, 1.0), "below 1: closer",
             published=sizes[0] / sizes[1],
         ))  # fmt: skip
     return Evaluation(
@@ -133,7 +133,7 @@ def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
         for axis in ("boom", "stick") for published in (_PRINTED_RMS_ERRORS[axis, kind],)
     ]  # fmt: skip
     ratio = _PRINTED_RMS_ERRORS["stick", kind] / _PRINTED_RMS_ERRORS["boom", kind]
-    checks.append(check_rms_ratio("stick over boom", samples,
+    checks.append(check_rms_ratio("RMS error of the stick over that of the boom", samples,
                                   (f"stick.{kind}.rms", f"boom.{kind}.rms"), (0.5 * ratio, np.inf),
                                   '"an order of magnitude worse": at least half the printed ratio',
                                   ratio))  # fmt: skip
@@ -141,7 +141,7 @@ def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
         for axis in ("boom", "stick"):
             ratio = _PRINTED_RMS_ERRORS[axis, kind] / _PRINTED_RMS_ERRORS[axis, "measured"]
             checks.append(check_rms_ratio(
-                f"computed over measured angles, {axis}", samples,
+                f"RMS error of the {axis} with computed over that with measured angles", samples,
                 (f"{axis}.identified.rms", f"{axis}.measured.rms"), (0.5 * ratio, 2.0 * ratio),
                 "a factor of 2 around one measurement", ratio,
             ))  # fmt: skip

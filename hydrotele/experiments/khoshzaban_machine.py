@@ -147,12 +147,12 @@ def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
     Differences may reach half of the last printed digit.
     """
     values = samples[0].values
-    checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
+    checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last printed digit", "kg")
               for n, v in _PUBLISHED_MASSES.items()]  # fmt: skip
     for name, centre in _PUBLISHED_MASS_CENTRES.items():
         for axis, published in zip("xz", centre, strict=True):
             checks.append(_check_published_value(f"centre of mass of the {name}, {axis}",
-                                      values[f"com_{axis}.{name}"], published, 0.005, "last digit",
+                                      values[f"com_{axis}.{name}"], published, 0.005, "last printed digit",
                                       "m"))  # fmt: skip
     return Evaluation(
         tuple(checks),
@@ -274,11 +274,12 @@ def find_identifiable_parameters(seed: int, changes: Changes) -> Sample:
 def evaluate_identifiable_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Check that the identifiable parameters of each stage are those of Khoshzaban 1992, section 3.6.4."""
     return Evaluation(tuple(
-        check_deterministic_value(f"parameters of the {link} stage that are in one list only",
-                    samples[0].values[f"different.{link}"], (0.0, 0.0), "the same lists",
+        check_deterministic_value(f"{link} stage: parameters that only the thesis or only the simulation identifies",
+                    samples[0].values[f"different.{link}"], (0.0, 0.0), "none: both lists are the same",
                     published=0.0)
         for link in IDENTIFIABLE_PARAMETERS
-    ), note="links 6 to 8 are assumed known to 1 mm and 0.05 deg from the laboratory")  # fmt: skip
+    ), note="the parameters of links 6 to 8 (calibrator) are assumed known from a laboratory to 1 mm and"
+        " 0.05 deg")  # fmt: skip
 
 
 def measure_held_link_drift(seed: int, changes: Changes) -> Sample:
@@ -351,18 +352,19 @@ def evaluate_held_link_drift(samples: Sequence[Sample]) -> Evaluation:
     ]  # fmt: skip
     return Evaluation(
         tuple(checks),
-        "in the scenarios closed spools leak 2.7e-14 m3/(s Pa) to tank (25 mm, 7.5 um radial"
-        " clearance), cylinders do not leak, and a run takes 120 s; the thesis gives no values."
-        " Ten times that leakage causes a drift of 1.5 deg of the boom and 0.26 to 0.30 deg of the"
-        " stick: no common coefficient gives the figures, in which the stick drifts more",
+        "in the simulation, closed valve spools leak 2.7e-14 m3/(s Pa) to tank (spool of 25 mm with"
+        " 7.5 um radial clearance), cylinders do not leak, and a run takes 120 s. The thesis gives no"
+        " leakage. With ten times this leakage the boom drifts by 1.5 deg and the stick by 0.26 to"
+        " 0.30 deg. No common leakage coefficient gives the figures of the thesis, in which the stick"
+        " drifts more than the boom",
     )
 
 
 def evaluate_closure(samples: Sequence[Sample]) -> Evaluation:
     """Check that the chain of Khoshzaban 1992, Table 2 closes within 0.01 mm for joint angles of the MuJoCo model."""
     return Evaluation((
-        check_deterministic_value("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
-                    "0.01 mm, much smaller than all errors in this study", unit="um"),
+        check_deterministic_value("largest gap of the chain", 1e6 * float(collect_values(samples, "gap").max()),
+                    (0.0, 10.0), "0.01 mm, much smaller than all errors in this study", unit="um"),
     ))  # fmt: skip
 
 
@@ -370,18 +372,19 @@ EXPERIMENTS = (
     Experiment("dimensions", read_machine_dimensions, (
         Claim("masses of the links", "M 8031, 1830, 688 kg; k_x 2.30 and 0.90, k_y 0.2 and 0.1 m",
               "Table 1, p. 18", "input", evaluate_masses, {"links.boom.mass": 1900.0},
-              "a heavier boom"),
+              "the boom's mass is 1900 instead of 1830 kg"),
         Claim("plates of boom and stick",
               "boom: L1 = 5.190, L2 = 2.000, L3 = 3.790, L4 = 2.443 m, gamma = 37.0 deg; stick:"
               " L1 = 1.800, L2 = 0.720, L3 = 2.425 m, gamma = 35 deg",
               "Figs 5 and 6, pp. 14-15", "input", evaluate_pin_distances,
               {"axes.boom.cylinder.rod_pin.position": (1.88, 0.0, 0.684)},
-              "the boom's rod pin 20 deg from its chord"),
+              "the boom's rod pin is 20 instead of 37 deg from the line between the boom's end pins"),
         Claim("cylinder triangles",
               "boom: l_l 0.625, l_u 2.000, l_c 1.447 m, offset 78.6 deg; stick: 2.444, 0.720,"
               " 1.799 m, 10.3 deg",
               "Figs 9 and 10, p. 19-20; Tables 3 and 11, pp. 57, 76", "input", evaluate_triangles,
-              {"axes.stick.cylinder.closed_length": 1.85}, "a longer stick cylinder"),
+              {"axes.stick.cylinder.closed_length": 1.85},
+              "the stick's cylinder is 1.85 instead of 1.80 m long when closed"),
         Claim("mobility of the closed chain",
               '"we thus need at least 1 extra link for the UBC experimental machine and 3 links for'
               ' the excavator"; with 4 sensed links 2 degrees of mobility',
@@ -392,29 +395,30 @@ EXPERIMENTS = (
               "36 numbers of nine frames, among them a1 = 0.340, d2 = -0.110, a2 = 5.180, d5 ="
               " 1.134, d7 = 2.994, a8 = 3.505 m",
               "Table 2, p. 56; Figs 4, 7 and 15, pp. 13, 16, 53", "input", evaluate_dh_parameters,
-              {"links.stick.position": (5.19, 0.0, 0.0)}, "the boom's length of Fig. 5"),
+              {"links.stick.position": (5.19, 0.0, 0.0)},
+              "the boom's length is 5.190 m (Fig. 5) instead of 5.180 m (Table 2)"),
         Claim("error of torque and force from pressures within 25 psi",
               "about 1400 N m (swing), 5700 N (boom), 4200 N (stick)",
               "section 4.4.3, p. 108", "input", evaluate_drive_force_errors_of_pressure,
-              {"axes.boom.cylinder.area_head": 0.01}, "a smaller boom cylinder"),
+              {"axes.boom.cylinder.area_head": 0.01}, "a piston area of the boom is reduced to 0.01 m2"),
     ), fixed_repetitions=1),
     Experiment("identifiable parameters", find_identifiable_parameters, (
         Claim("identifiable parameters of each stage",
               "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3"
-              " and 2: the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
+              " and 2: the constant angle of the next outer link, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
               " a1; in addition, the ball's p_xy and p_z",
               "section 3.6.4, pp. 54-56", "document", evaluate_identifiable_parameters, {"wander": 0.0},
-              "the grapple does not rotate"),
+              "the grapple does not rotate during the stages"),
     ), fixed_repetitions=1),
     Experiment("held links", measure_held_link_drift, (
         Claim("held links drift while one moves",
               '"there will be a drift at the endpoint of each link which is actuated by a hydraulic'
               ' jack": 0.4 to 0.8 deg of boom and stick in the figures, none of the swing',
               "Figs 16 to 18, section 3.7.1, pp. 57-59", "document", evaluate_held_link_drift,
-              {"pilot.closed_valves": "[]"}, "the servo holds the links instead of closed valves"),
+              {"pilot.closed_valves": "[]"}, "servo control instead of closed valves holds the links"),
         Claim("closure of the kinematic chain",
-              "the chain of Table 2 closes on the angles of the MuJoCo model",
+              "with the joint angles of the MuJoCo model, the closed chain with the dimensions of Table 2 has no gap",
               "Figs 16 to 18, pp. 57-59", "additional", evaluate_closure,
-              {"a.boom": 5.19}, "the chain has the boom's length of Fig. 5", ()),
+              {"a.boom": 5.19}, "the boom's length in the chain is 5.190 m (Fig. 5) instead of 5.180 m (Table 2)", ()),
     ), fixed_repetitions=1),
 )  # fmt: skip

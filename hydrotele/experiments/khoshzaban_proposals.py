@@ -172,11 +172,10 @@ def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
     plain = float(np.mean(collect_values(samples, "plain_covered")))
     return Evaluation(
         (ratio, covered),
-        explanation="flexibility at full load: standard deviation of the joint's bend when the ball joint is"
-        " horizontally as far away as the links beyond the joint can reach",
-        note=f"without the noise model {100 * plain:.0f} % of the intervals do so; estimated"
+        note=f"without the noise model {100 * plain:.0f} % of the intervals contain it; estimated"
         f" flexibility at full load {np.mean(collect_values(samples, 'grapple')):.2f} deg (grapple) and"
-        f" {np.mean(collect_values(samples, 'yoke')):.2f} deg (yoke)",
+        f" {np.mean(collect_values(samples, 'yoke')):.2f} deg (yoke): standard deviation of the joint's bend when the"
+        " ball joint is horizontally as far away as the links beyond the joint can reach",
     )
 
 

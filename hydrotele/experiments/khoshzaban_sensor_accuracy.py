@@ -172,12 +172,12 @@ def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "fraction of base parameters of the complete model with errors above half of their"
         " size", np.mean(errors > 0.5, axis=1), (0.8, 1.0),
-        "almost all: four of five; an error above half of the size is large",
+        "\"almost all\": at least four of five; an error above half of the size is large",
     )  # fmt: skip
     medians = ", ".join(
         f"{m} {np.median(_stack_parameter_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
     )
-    return Evaluation((check,), note=f"median error over size: {medians}")
+    return Evaluation((check,), note=f"median of error over size of the parameter: {medians}")
 
 
 def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
@@ -216,7 +216,7 @@ def evaluate_reduced_model_errors(samples: Sequence[Sample]) -> Evaluation:
     )
     check = check_bootstrapped_statistic(
         f"error in the complete over error in the reduced model, median of {len(shared)} common"
-        " parameters", rows, _compute_median_error_ratio, (2.0, np.inf), "much less: at most half",
+        " parameters", rows, _compute_median_error_ratio, (2.0, np.inf), "\"much less\": at most half",
     )  # fmt: skip
     return Evaluation((check,))
 
@@ -233,7 +233,7 @@ SENSOR_NOISE_EXPERIMENT = Experiment(
             "large errors of the complete model",
             '"almost all the identified parameters contain large errors"',
             "Table 14, pp. 108 and 109", "document", evaluate_large_errors,
-            fault={"noise": 1e-6}, fault_description="sensors a million times more accurate",
+            fault={"noise": 1e-6}, fault_description="sensors are a million times more accurate",
         ),
         Claim(
             "five times better pressure sensors, complete model",
@@ -262,7 +262,8 @@ SENSOR_NOISE_EXPERIMENT = Experiment(
             '"the error in the individual parameters of the reduced model is much less than that of'
             ' the corresponding parameters for the complete model."',
             "Tables 14 and 15, p. 110", "document", evaluate_reduced_model_errors,
-            fault={"cylinders_known": True}, fault_description="cylinders of the complete model known",
+            fault={"cylinders_known": True},
+            fault_description="the parameters of the cylinders are known, so that both models have the same unknowns",
         ),
     ),
     max_repetitions=40,
@@ -294,7 +295,7 @@ def evaluate_force_accuracy(samples: Sequence[Sample]) -> Evaluation:
         tuple(
             check_deterministic_value(f"largest error, {drive}", samples[0].values[drive],
                         (limit - 50.0, 1.001 * (limit + 50.0)), unit=unit, published=limit,
-                        reason="printed to hundreds: within 50; up to 0.1 % more, because the document's"
+                        reason="printed to hundreds: within 50, and 0.1 % more, because the document's"
                         " pound-force is 0.1 % too small")
             for drive, limit, unit in zip(DRIVES, SENSOR_ACCURACY, UNITS, strict=True)
         )
@@ -307,7 +308,7 @@ FORCE_ACCURACY = Experiment(
         Claim(
             "accuracy of forces", "cabin: +-1400 N m, boom: +-5700 N, stick: +-4200 N",
             "Eqs 4.33 and 4.61, p. 108", "input", evaluate_force_accuracy,
-            fault={"accuracy_psi": 5.0}, fault_description="sensors of 5 psi",
+            fault={"accuracy_psi": 5.0}, fault_description="pressure sensors have errors of 5 instead of 25 psi",
         ),
     ),
     fixed_repetitions=1,

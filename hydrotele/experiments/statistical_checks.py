@@ -135,12 +135,11 @@ def check_published_in_population(
     distance = float((goal - np.mean(scaled)) / spread) if n > 1 and spread else np.nan
     half = _NORMAL_QUANTILE * np.sqrt(1.0 / n + distance**2 / (2.0 * n))
     typical = float(np.exp(np.mean(scaled)) if log else np.mean(values))
-    words = f"{quantity} {published:.3g} {unit}".strip()
+    unit = f" {unit}" if unit else ""
     return Check(
-        f"distance of the published {words} from the simulated ones (mean {typical:.3g}) in"
-        " standard deviations",
+        f"{quantity}: published {published:.3g}{unit}, mean of the repetitions {typical:.3g}{unit}; distance",
         distance, distance - half, distance + half, (-_NORMAL_QUANTILE, _NORMAL_QUANTILE),
-        "the central 95 % of the repetitions",
+        "the central 95 % of the repetitions", "standard deviations",
     )  # fmt: skip
 
 

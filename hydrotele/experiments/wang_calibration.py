@@ -131,17 +131,18 @@ def _evaluate_accurate_model(samples: Sequence[Sample]) -> Evaluation:
     within = [sample.values["largest"] < REQUIRED_ACCURACY for sample in samples]
     return Evaluation(
         (_check_accuracy("RMS position error at 25 test poses", samples, "position after"),
-         check_fraction("robots with all 25 poses within 0.1 mm", within, (0.5, 1.0),
+         check_fraction("fraction of the robots with all 25 poses within 0.1 mm", within, (0.5, 1.0),
                         "more than half of the robots; the publication had one")),
         "The sensor noise is an assumption; errors are proportional to it.",
-        f"RMS {format_values(samples, 'position before', 1e3, 2)} mm before",
+        f"RMS before calibration {format_values(samples, 'position before', 1e3, 2)} mm",
     )  # fmt: skip
 
 
 def _evaluate_intervals(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation((check_mean(
-        "assumed errors within their 95 % intervals", 100.0 * collect_values(samples, "inside"),
-        (92.0, 98.0), "95 %; a deviation of 3 % is a standard deviation wrong by one sixth",
+        "fraction of the assumed errors within their 95 % intervals", 100.0 * collect_values(samples, "inside"),
+        (92.0, 98.0), "95 % expected; 92 and 98 % result from standard deviations that are 11 % too small or 19 %"
+        " too large",
         unit="%"),))  # fmt: skip
 
 
@@ -189,7 +190,7 @@ def measure_poe_model(seed: int, changes: Changes) -> Sample:
 
 def _evaluate_poe_model(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
-        (check_mean("independent parameters of the 54", collect_values(samples, "rank"), (54.0, 54.0),
+        (check_mean("number of independent parameters among the 54", collect_values(samples, "rank"), (54.0, 54.0),
                     "all: complete and minimal"),
          _check_accuracy("RMS position error at 25 test poses", samples, "test")),
         "The sensor noise is an assumption; errors are proportional to it.",
@@ -345,9 +346,9 @@ def _evaluate_wire_poses(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_mean("largest error of a pose from exact lengths", collect_values(samples, "exact"),
                     (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),
-         check_mean("squared pose error over that of the propagated covariance",
+         check_mean("squared pose error over its expectation from the propagated covariance",
                     collect_values(samples, "squares"), (0.9, 1.1),
-                    "1; 10 % of the square are 5 % of the standard deviation")),
+                    "1 expected; 10 % of the square are 5 % of the standard deviation")),
     )  # fmt: skip
 
 
@@ -404,7 +405,7 @@ REFINED_MODEL = Experiment(
             "redundant parameters deteriorate the identification",
             '"the redundant parameters have to be eliminated since they would deteriorate the'
             ' identification result"', "section 2.1 (p. 24)", "document", _evaluate_redundancy,
-            {"document": False}, "the robot has errors in all 54 parameters", panel_labels=(),
+            {"document": False}, "the robot has errors in all 54 parameters instead of only in the 36", panel_labels=(),
         ),
         Claim(
             "accurate kinematic model",

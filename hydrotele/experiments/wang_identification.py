@@ -150,10 +150,10 @@ def _evaluate_posterior_redundancy(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_mean("posterior over prior standard deviation along the redundant directions of QR",
                     collect_values(samples, "posterior over prior"), (0.9, 1.1),
-                    "1: no information; 10 % is the error of a sampled standard deviation"),
+                    "1: the data give no information there; 10 % is the error of a sampled standard deviation"),
          check_mean("posterior standard deviation over that from the singular values, RMS over the"
                     " other directions", collect_values(samples, "posterior over theory"), (0.9, 1.1),
-                    "1: both methods agree; 10 % as before"),
+                    "1: both methods agree; 10 % as for (1)"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'redundant', digits=0)} redundant parameters by QR; along"
         f" {format_values(samples, 'weak', digits=0)} directions the data are less informative than"
@@ -236,10 +236,10 @@ def _evaluate_refined_posterior(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_mean("largest distance of a posterior mean from least squares, in standard"
                     " deviations", collect_values(samples, "shift"), (-np.inf, 0.2),
-                    "this shift reduces the coverage of a 95 % interval by half a percent"),
+                    "with this shift a 95 % interval contains half a percent less"),
          check_mean("posterior over least-squares standard deviation, RMS of 36",
                     collect_values(samples, "ratio"), (0.95, 1.05),
-                    "1; a 95 % interval that is 5 % too short has a coverage of 94 %"),
+                    "1 expected; a 95 % interval that is 5 % too short contains 94 %"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'inside', digits=1)} of 36 assumed errors are within the"
         " central 95 %",
@@ -294,8 +294,8 @@ def _evaluate_independent_parameters(samples: Sequence[Sample]) -> Evaluation:
         return format_values(samples, name, digits=0)
 
     return Evaluation(
-        (check_mean("independent parameters of the 54", collect_values(samples, "rank dh"), (36.0, 36.0),
-                    "the refined model has as many, and must be minimal (p. 24)",
+        (check_mean("number of independent parameters among the 54", collect_values(samples, "rank dh"), (36.0, 36.0),
+                    "the refined model has 36, and must be minimal (p. 24)",
                     published=36.0),),
         f"Four parameters are redundant: theta4, d4, a4 and alpha4 have the same effect as a"
         f" common displacement of A1 to A6. Only without tilt of the platform A_i and B_i"
@@ -462,7 +462,7 @@ REFINED_POSTERIOR = Experiment(
             "Posterior means and standard deviations of the 36 parameters with sensor noise equal"
             " those of least squares.", "Table 5, section 3.4", "additional",
             _evaluate_refined_posterior, {"chain_noise": 2.0},
-            "the chain assumes twice the sensor noise", panel_labels=(),
+            "MCMC assumes twice the true sensor noise", panel_labels=(),
         ),
         make_caption_claim(
             "36 parameters, with measurement noise", "Table 5 (p. 54)",

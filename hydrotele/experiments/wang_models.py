@@ -88,7 +88,7 @@ def _evaluate_carriage_kinematics(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(
         (check_deterministic_value("largest difference of a coordinate", samples[0].values["difference"],
                      (0.0, MAX_ROUNDING), "rounding", unit="m"),),
-        note="200 random poses; minus signs, missing in the available text, follow from Table 1",
+        note="200 random poses; the minus signs, which the available text does not show, follow from Table 1",
     )  # fmt: skip
 
 
@@ -254,7 +254,7 @@ def _evaluate_error_growth(samples: Sequence[Sample]) -> Evaluation:
         checks.append(check_bootstrapped_statistic(
             f"second-order error with doubled {words} over the usual one", pairs,
             lambda rows: float(np.sqrt(np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
-            (1.0, np.inf), "increases",
+            (1.0, np.inf), "above 1: increases",
         ))  # fmt: skip
     return Evaluation(tuple(checks))
 
@@ -305,9 +305,9 @@ def _evaluate_parameter_change_with_tilt(samples: Sequence[Sample]) -> Evaluatio
     exponents = {name: np.array([s.values[name] for s in samples]) for name in ("dh", "poe")}
     return Evaluation(
         (check_mean("exponent of the change of d (D-H) with the tilt", exponents["dh"],
-                    (-np.inf, 0.0), "not proportional: it does not decrease with the tilt"),
+                    (-np.inf, 0.0), "proportional would be 1; at 0 or below, d does not become small with the tilt"),
          check_mean("exponent of the change of the axis (POE) with the tilt", exponents["poe"],
-                    (0.99, 1.01), "proportional: 1, up to the second order of 10 mrad")),
+                    (0.99, 1.01), "1: proportional, except for second-order terms of 10 mrad")),
         note="two parallel hinges 0.2 to 0.5 m apart, tilts of 0.1 to 10 mrad; a tilt of 1 mrad"
         f" changes d by {format_values(samples, 'dh at 1 mrad', 1.0, 0)} m",
     )  # fmt: skip
@@ -352,7 +352,7 @@ def _evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
                     "a hundredth of the required accuracy, page 19", unit="mm or mrad"),),
         note=f"against Newton's method at {len(samples)} random poses; the closed-chain"
         f" MuJoCo model differs by {largest['mechanism']:.1e} m or rad, and the inverse kinematics"
-        f" gives the leg lengths back to {largest['inverse']:.1e} m",
+        f" returns the leg lengths to within {largest['inverse']:.1e} m",
     )  # fmt: skip
 
 
@@ -370,7 +370,7 @@ KINEMATICS = Experiment(
             "size of the error model",
             '"the number of parameter errors for the serial part is 12"; "the number of parameter'
             ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _evaluate_parameter_error_counts,
-            {"second_joint": "revolute"}, "the second joint is a hinge",
+            {"second_joint": "revolute"}, "the second joint of the carriage is a hinge instead of a slide",
         ),
     ),
     fixed_repetitions=1,
@@ -416,7 +416,7 @@ FIRST_ORDER = Experiment(
             "first-order error model",
             '"the first-order model is sufficiently accurate for most applications"',
             "Eqs 12 to 26 (p. 31 to 33)", "document", _evaluate_first_order, {"error_size": 10.0},
-            "manufacturing errors of 10 mm and 10 mrad",
+            "manufacturing errors of 10 mm and 10 mrad instead of 1 mm and 1 mrad",
         ),
         Claim(
             "second-order errors grow with size and errors",
@@ -436,7 +436,7 @@ PROPORTIONALITY = Experiment(
             'the D-H model "fails to be proportional when the two consecutive joint axes are'
             ' parallel or nearly parallel"; "the POE model can perfectly meet the proportionality'
             ' properties"', "section 2.1 (p. 24)", "document", _evaluate_parameter_change_with_tilt,
-            {"parallel": False}, "the axes are perpendicular",
+            {"parallel": False}, "the axes are perpendicular instead of nearly parallel",
         ),
     ),
 )  # fmt: skip

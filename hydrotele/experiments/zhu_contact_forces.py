@@ -163,7 +163,7 @@ def _evaluate_operators_within_jnd(samples: Sequence[Sample]) -> Evaluation:
         collect_values(samples, "error") < JUST_NOTICEABLE_DIFFERENCE,
     )
     explanation = (
-        f"reasonably good: {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} %, the just noticeable difference of a"
+        f"reasonably good is taken as {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} %, the just noticeable difference of a"
         " compliance (Tan 1995). Perception errors of that fraction in the stiffness and K_nom"
         " cause force errors of 33 % at 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the"
         " operator of the thesis practised with the force on a screen, the simulated one only knows"
@@ -186,7 +186,7 @@ def _evaluate_hand_force_proportionality(samples: Sequence[Sample]) -> Evaluatio
         collect_values(samples, "line"), (0.0, _MAX_DEVIATION),
         "proportional, except for damping and inertia of the moving handle",
     )  # fmt: skip
-    note = f"from a line of fixed slope {format_values(samples, 'fixed_line', 100.0, 0)} %"
+    note = f"RMS deviation from a line of fixed slope: {format_values(samples, 'fixed_line', 100.0, 0)} %"
     return Evaluation((check,), "the slope follows the contact force (4.1)", note)
 
 
@@ -202,11 +202,11 @@ def _evaluate_direct_feedback(samples: Sequence[Sample]) -> Evaluation:
                        " ripple", collect_values(samples, "ripple") < _MAX_RIPPLE),
     )  # fmt: skip
     note = (
-        f"{format_values(samples, 'held', 1e-3)} kN with {samples[0].values['ratio']:.1e} N/N,"
+        f"contact force {format_values(samples, 'held', 1e-3)} kN with {samples[0].values['ratio']:.1e} N/N,"
         f" ripple {format_values(samples, 'ripple', 100.0, 0)} %"
     )
     explanation = (
-        f"with this ratio 50 kN (Table 6.8) give {50e3 * _PUBLISHED_FORCE_RATIO:.0f} N, which is close to the"
+        f"with this ratio, 50 kN (Table 6.8) give {50e3 * _PUBLISHED_FORCE_RATIO:.0f} N at the hand, close to the"
         " stability limit; the force filter has the highest bandwidth (5 Hz), because the thesis"
         " mentions no filter"
     )
@@ -294,9 +294,13 @@ def _evaluate_feedback_limits(samples: Sequence[Sample]) -> Evaluation:
     words = [one[0] for one in FEEDBACK_CONDITIONS]
     published = 50e3 * _PUBLISHED_FORCE_RATIO
     checks = (
-        check_deterministic_value("conditions under which direct feedback has a limit", int(exists.sum()),
-                    (len(FEEDBACK_CONDITIONS), len(FEEDBACK_CONDITIONS)), "severely restricted: under all"),
-        check_deterministic_value("limit of the reflected force for 50 kN in the reference condition",
+        check_deterministic_value(
+            "conditions, of 9, under which direct feedback has a stability limit", int(exists.sum()),
+            (len(FEEDBACK_CONDITIONS), len(FEEDBACK_CONDITIONS)),
+            "\"severely restricted\": a limit under all conditions"),
+        check_deterministic_value(
+            "stability limit of the reflected force for a contact force of 50 kN, in the reference "
+                "condition",
                     5e4 * limits[0], (published / _SEARCH_ERROR, np.inf),
                     "the published 4.5 N were held, the search is accurate to a factor of"
                     f" {_SEARCH_ERROR:g}", unit="N", published=published),
@@ -376,13 +380,15 @@ def _evaluate_tracking(samples: Sequence[Sample]) -> Evaluation:
     for key, words in (("detent", "with detents"), ("plain", "without detents")):
         pairs = np.stack([collect_values(samples, f"{kind}_{key}") for kind in ("none", "stiffness")], 1)
         checks.append(check_bootstrapped_statistic(
-            f"mean RMS error without reflection over that with reflection, {words}", pairs,
+            "mean RMS error of the tracked force without reflection over that with reflection, "
+                f"{words}", pairs,
             lambda rows: float(np.mean(rows[:, 0]) / np.mean(rows[:, 1])),
             (_MIN_IMPROVEMENT, np.inf),
-            "greatly: twice; the thesis does not say whether the detents were on",
+            "\"greatly improves\": half of the error; the thesis does not say whether the detents were "
+                "on",
         ))  # fmt: skip
     note = "; ".join(
-        f"{words}: {format_values(samples, f'stiffness_{key}', 1e-3)} kN with reflection,"
+        f"RMS error {words}: {format_values(samples, f'stiffness_{key}', 1e-3)} kN with reflection,"
         f" {format_values(samples, f'none_{key}', 1e-3)} kN without"
         for key, words in (("detent", "with detents"), ("plain", "without detents"))
     )
@@ -403,7 +409,7 @@ STIFFNESS_FEEDBACK = (
             "document",
             _evaluate_operators_within_jnd,
             {"pilot.reflection": "none"},
-            "no reflection",
+            "no force reflection",
         ),
         Claim(
             "stiffness feedback: force over displacement",
@@ -422,7 +428,7 @@ STIFFNESS_FEEDBACK = (
             "additional",
             _evaluate_target_forces,
             {"pilot.reflection": "none"},
-            "no reflection",
+            "no force reflection",
         ),
     )),
     Experiment("direct feedback", partial(measure_direct_feedback, _PUBLISHED_FORCE_RATIO), (
@@ -464,7 +470,7 @@ FORCE_TRACKING = (
             "document",
             _evaluate_tracking,
             {"pilot.reflection": "none"},
-            "no reflection in both",
+            "no force reflection in both runs",
         ),
     ), 10),
 )  # fmt: skip

@@ -128,9 +128,9 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
 
 def _evaluate_static_model(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
-        "false force of the static model in joint steps over that at rest",
+        "false force of the static model during joint steps over that at rest",
         collect_values(samples, "ratio"), (_MIN_MOTION_RATIO, np.inf),
-        "big: three times the error at rest",
+        "\"big\": at least three times the error at rest",
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'static_feller_joint_steps', 1e-3, 2)} kN RMS during the steps,"
@@ -145,7 +145,7 @@ def _evaluate_dynamic_model(samples: Sequence[Sample]) -> Evaluation:
         (0.0, _MAX_ERROR_RATIO), "a limit of this project",
     )  # fmt: skip
     note = (
-        f"{format_values(samples, 'static', 1e-3, 2)} kN RMS with the static model,"
+        f"false force {format_values(samples, 'static', 1e-3, 2)} kN RMS with the static model,"
         f" {format_values(samples, 'dynamic', 1e-3, 2)} kN with the dynamic one:"
         f" {format_values(samples, 'dynamic_feller_joint_steps', 1e-3, 2)} kN in joint steps,"
         f" {format_values(samples, 'dynamic_feller_steps', 1e-3, 2)} kN in steps of the joystick"

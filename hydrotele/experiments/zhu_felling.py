@@ -235,8 +235,8 @@ def _evaluate_push_back(samples: Sequence[Sample]) -> Evaluation:
     pushed_back = (collect_values(samples, "with_handle") < _DEADBAND_WIDTH) & (
         collect_values(samples, "without_handle") > _DEADBAND_WIDTH
     )
-    check = check_fraction("operators whose handle is in the dead band with reflection and outside"
-                           " without", pushed_back)  # fmt: skip
+    check = check_fraction("operators whose handle is pushed into the dead band with reflection and stays outside "
+                "without", pushed_back)  # fmt: skip
     note = (
         f"a hand with constant force is pushed from {format_values(samples, 'with_before', 1e3)}"
         f" to {format_values(samples, 'with_handle', 1e3)} mm; without reflection it stays at"
@@ -249,7 +249,7 @@ def _evaluate_push_back(samples: Sequence[Sample]) -> Evaluation:
 def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
     reason = "the machine tips at 1; mass and gauge are not in the thesis"
     checks = tuple(
-        check_mean(f"largest fraction of the tipping moment {words}",
+        check_mean(f"largest moment over the tipping moment, {words}",
                    collect_values(samples, f"{key}_share"), accepted, reason)
         for key, words, accepted in (
             ("with", "with reflection on rock of 2 MN/m", (0.0, 1.0)),
@@ -304,7 +304,7 @@ def _evaluate_protection(samples: Sequence[Sample]) -> Evaluation:
         (kept < 1.0) & (bare > 1.0), reason="a statement on most operators",
     )  # fmt: skip
     note = (
-        f"largest fraction of the tipping moment {format_values(samples, 'spring_share', 1.0, 2)}"
+        f"largest moment over the tipping moment: {format_values(samples, 'spring_share', 1.0, 2)}"
         f" with the spring, {format_values(samples, 'bare_share', 1.0, 2)} without; handle within"
         f" {format_values(samples, 'spring_handle', 1e3)} mm after 10 s"
     )
@@ -322,7 +322,7 @@ TIP_OVER = (
             "document",
             _evaluate_push_back,
             {"pilot.reflection": "none"},
-            "no reflection in both",
+            "no force reflection in both runs",
         ),
         Claim(
             "tip-over avoided by stiffness feedback alone",
@@ -332,7 +332,7 @@ TIP_OVER = (
             "document",
             _evaluate_tip_over,
             {"pilot.reflection": "none"},
-            "no reflection in both",
+            "no force reflection in both runs",
         ),
     ), 6),
     Experiment("added spring", simulate_tip_over_protection, (
@@ -368,7 +368,7 @@ FELLING = (
             "document",
             _evaluate_felt_stiffness,
             {"pilot.reflection": "none"},
-            "no reflection",
+            "no force reflection",
         ),
         Claim(
             "a tree felled: the process",

@@ -99,7 +99,7 @@ def _evaluate_line(samples: Sequence[Sample]) -> Evaluation:
                    "constant: the width of a drawn line on the plot's axis of 60 deg", unit="deg"),
     )  # fmt: skip
     note = (
-        f"deviates by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
+        f"largest deviation {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
         f" {format_values(samples, 'sideways', 1e3, 0)} mm"
     )
     return Evaluation(checks, "the thesis gives no values", note)
@@ -368,7 +368,8 @@ def _evaluate_pressure_oscillation(joint: str, samples: Sequence[Sample]) -> Eva
     check = check_mean(
         "pressure from peak to peak over the pressure before the step",
         collect_values(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
-        "huge: half of the pressure that carries the arm; no values of the curves are legible",
+        "\"huge\": at least half of the pressure that carries the arm; no values of the curves are "
+                "legible",
     )  # fmt: skip
     note = (
         f"{format_values(samples, f'{joint}_swing', 1e-6, 0)} MPa from peak to peak on"

@@ -103,9 +103,9 @@ def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
     """
     reason = "converged to 1 % of the largest parameter"
     return Evaluation((
-        check_mean("largest change of a parameter in the second half of the samples, over the"
-                   " largest parameter", collect_values(samples, "late"), (-np.inf, _MAX_RELATIVE_CHANGE), reason),
-        check_mean("largest final error of a parameter, over the largest parameter",
+        check_mean("largest change of a parameter during the second half of the samples, relative to the "
+                "largest parameter", collect_values(samples, "late"), (-np.inf, _MAX_RELATIVE_CHANGE), reason),
+        check_mean("largest final error of a parameter, relative to the largest parameter",
                    collect_values(samples, "error"), (-np.inf, 2.0 * _MAX_RELATIVE_CHANGE),
                    "2 %: the static model neglects inertia and the shape of friction"),
     ))  # fmt: skip
@@ -189,11 +189,11 @@ def _pair_errors_with_clean(samples: Sequence[Sample], name: str) -> np.ndarray:
 def evaluate_outlier_effect(samples: Sequence[Sample]) -> Evaluation:
     """Check that sensor failures at least double the error of the gravity parameters."""
     return Evaluation(
-        (check_bootstrapped_statistic("error with over error without sensor failures",
+        (check_bootstrapped_statistic("parameter error with sensor failures over that without",
                          _pair_errors_with_clean(samples, "spoilt"), _compute_ratio_of_means, (2.0, np.inf),
                          "strong: at least twice; no size is published"),),
-        note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter against"
-        f" {format_values(samples, 'clean', 100.0)} %",
+        note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter with sensor failures,"
+        f" {format_values(samples, 'clean', 100.0)} % without",
     )  # fmt: skip
 
 
@@ -211,7 +211,9 @@ def evaluate_outlier_removal(samples: Sequence[Sample]) -> Evaluation:
     """Check that removing outliers eliminates at least 75 % of the parameter error that sensor failures cause."""
     rows = np.column_stack([collect_values(samples, name) for name in ("spoilt", "kept", "clean")])
     return Evaluation(
-        (check_bootstrapped_statistic("fraction of the error due to failures that the removal eliminates",
+        (check_bootstrapped_statistic(
+            "fraction of the additional error due to sensor failures that the removal of outliers "
+                "eliminates",
                          rows, _compute_removed_fraction, (0.75, np.inf),
                          "eliminated: at least three quarters; no size is published"),),
         note=f"{format_values(samples, 'kept', 100.0)} % of the largest parameter;"

@@ -169,9 +169,11 @@ def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
 def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
     """Check that the closed-form inverse kinematics solves all random poses in reach, to 1e-6 m."""
     return Evaluation(tuple(
-        check_deterministic_value(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
-                    samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
-                    " increases at a straight elbow", unit="m") for name in _MACHINE_TOOLS
+        check_deterministic_value(
+            f"largest position error of the closed-form solution among {_POSE_COUNT} reachable poses, "
+            f"{name}",
+            samples[0].values[f"back {name}"], (0.0, 1e-6),
+            "rounding only; it increases at a straight elbow", unit="m") for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
 
@@ -181,8 +183,10 @@ def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
     Whether a pose is in reach is found by a search over the elbow angle.
     """
     return Evaluation(tuple(
-        check_deterministic_value(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
-                    f" form and a search over the elbow agree, {name}",
+        check_deterministic_value(
+            f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed form and "
+                "a numerical search over the elbow angle agree whether a solution exists, "
+                f"{name}",
                     samples[0].values[f"agree {name}"], (1.0, 1.0), "agreement for all poses")
         for name in _MACHINE_TOOLS
     ))  # fmt: skip
@@ -247,14 +251,14 @@ def evaluate_solution_counts(samples: Sequence[Sample]) -> Evaluation:
     """
     v = samples[0].values
     return Evaluation((
-        check_deterministic_value("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
+        check_deterministic_value("largest number of solutions with approach 1", v["first"], (1.0, 2.0),
                     "at most two"),
-        check_deterministic_value("largest number of solutions, approach 2", v["second"], (1.0, 4.0),
+        check_deterministic_value("largest number of solutions with approach 2", v["second"], (1.0, 4.0),
                     "at most four"),
-        check_deterministic_value("extraneous candidates per pose, approach 1 minus approach 2",
+        check_deterministic_value("extraneous candidates per pose of approach 1, minus those of approach 2",
                     v["extra_first"] - v["extra_second"], (-np.inf, -1e-9), "fewer"),
-    ), note=f"extraneous candidates per pose {v['extra_first']:.2f} of 2 and"
-       f" {v['extra_second']:.2f} of 4")  # fmt: skip
+    ), note=f"extraneous candidates per pose: {v['extra_first']:.2f} of 2 with approach 1, "
+                f"{v['extra_second']:.2f} of 4 with approach 2")  # fmt: skip
 
 
 _CYCLE_CHANGES = {
@@ -328,22 +332,25 @@ def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
     """
     return Evaluation(
         (
-            check_bootstrapped_statistic("error of the references' radius after two cycles over that after one",
+            check_bootstrapped_statistic(
+                "radius error of the commanded path after two cycles over that after one cycle",
                             _collect_pairs(samples, "twice jacobian", "once jacobian"), _compute_ratio_of_means,
                             (1.0, np.inf), "it accumulates"),
-            check_bootstrapped_statistic("largest deviation of the radius over that by inverse kinematics",
+            check_bootstrapped_statistic(
+                "largest radius deviation of the bucket with the inverse Jacobian over that with inverse "
+                "kinematics",
                             _collect_pairs(samples, "stray jacobian", "stray kinematics"),
                             _compute_ratio_of_means, (2.0, np.inf),
-                            "low: at least twice as much; no size is published"),
+                            "\"low accuracy\": at least twice the deviation; no size is published"),
         ),
-        explanation="the rates are integrated to references of closed joint loops, whose path"
-        f" deviates by {format_values(samples, 'twice jacobian', 1e3, 2)} mm in two cycles, because"
-        " the Jacobian is evaluated at measured angles, which are delayed; with inverse kinematics"
-        f" the machine deviates by {format_values(samples, 'stray kinematics', 1e3)} mm."
-        " Deviations are large only with open joint loops:"
-        f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
-        note=f"{format_values(samples, 'stray jacobian', 1e3)} mm against"
-        f" {format_values(samples, 'stray kinematics', 1e3)} mm",
+        explanation="the integrated rates are the references of closed joint loops. These references deviate "
+                f"by only {format_values(samples, 'twice jacobian', 1e3, 2)} mm in two cycles, because the "
+                "Jacobian is evaluated at delayed measured angles. The machine itself deviates by "
+                f"{format_values(samples, 'stray kinematics', 1e3)} mm even with inverse kinematics. "
+                "Deviations are large only with open joint loops: "
+                f"{format_values(samples, 'stray rates', 1e3, 0)} mm",
+        note=f"largest deviation {format_values(samples, 'stray jacobian', 1e3)} mm with the inverse Jacobian,"
+        f" {format_values(samples, 'stray kinematics', 1e3)} mm with inverse kinematics",
     )  # fmt: skip
 
 
@@ -353,16 +360,17 @@ def evaluate_motion_accuracy(samples: Sequence[Sample]) -> Evaluation:
     The joint rates are those of the inverse Jacobian with open joint loops.
     """
     return Evaluation(
-        (check_bootstrapped_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
-                         " alone, over that by inverse kinematics with closed joint loops",
+        (check_bootstrapped_statistic(
+            "largest radius deviation with joint rates of the inverse Jacobian and open joint loops, "
+                "over that with inverse kinematics and closed joint loops",
                          _collect_pairs(samples, "stray rates", "stray kinematics"), _compute_ratio_of_means,
-                         (2.0, np.inf), "high: at least twice as accurate; no size is published"),),
+                         (2.0, np.inf), "\"high accuracy\": at most half of the deviation; no size is published"),),
         explanation="the closed joint loops determine the accuracy: the deviation of inverse"
         " kinematics with open loops is"
         f" {format_values(samples, 'stray open', 1e3, 0)} mm, that of the"
         f" inverse Jacobian with closed loops {format_values(samples, 'stray jacobian', 1e3)} mm",
-        note=f"{format_values(samples, 'stray kinematics', 1e3)} mm in 1.4 m against"
-        f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
+        note=f"largest deviation {format_values(samples, 'stray kinematics', 1e3)} mm with closed loops,"
+        f" {format_values(samples, 'stray rates', 1e3, 0)} mm with open loops, in a travel of 1.4 m",
     )  # fmt: skip
 
 
@@ -444,12 +452,12 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "inverse kinematics in closed form",
         '"In this chapter, closed-form inverse kinematics solutions are provided for typical'
         ' hydraulic mobile machines, excavators and feller-bunchers"', "p. 10, Fig. 2.8",
-        evaluate_inverse_kinematics, {"stick": 1.01}, "a stick 1 % too long in the closed form",
+        evaluate_inverse_kinematics, {"stick": 1.01}, "the closed form assumes a stick that is 1 % too long",
     ), make_claim(
         "no solution out of reach",
         '"assuming the specified endpoint frame is within the manipulator\'s work space; Otherwise,'
         ' solution does not exist."', "p. 15", evaluate_reachability, {"stick": 1.1},
-        "a stick 10 % too long in the closed form",
+        "the closed form assumes a stick that is 10 % too long",
     )),
     make_deterministic_experiment("number of solutions", count_inverse_kinematics_solutions, make_claim(
         "feller-buncher: number of solutions",
@@ -462,7 +470,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "inverse Jacobian: error accumulates",
         '"Since position error can accumulate, the inverse Jacobian method suffers from low'
         ' accuracy."', "p. 10, Eq. 2.1", evaluate_accumulation,
-        {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics instead",
+        {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics in both runs",
     ), make_claim(
         "inverse kinematics and closed joint loops: accuracy",
         '"It is clear from these plots that the motion accuracy is high due to the fact inverse'

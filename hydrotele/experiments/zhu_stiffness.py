@@ -43,7 +43,9 @@ def integrate_rising_damping(changes: Changes) -> Sample:
         changes: `stiffness`: K [1/s^2].
 
     Returns:
-        `end`: position x after 12 s with exponential damping; `slow`: |x| after 100 s with slowly
+        `end`: position "
+                "x(t) after 12 s"
+                " with exponential damping; `slow`: |x| after 100 s with slowly
         increasing damping.
     """
     given = merge_settings({"stiffness": 1.0}, changes)
@@ -72,7 +74,7 @@ def evaluate_rising_damping(samples: Sequence[Sample]) -> Evaluation:
     """
     v = samples[0].values
     return Evaluation((
-        check_deterministic_value("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
+        check_deterministic_value("x(t) after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
                     "1 + exp(-12) is 6 10^-6 above 1; the remaining tolerance is for integration",
                     published=1.0),
         check_deterministic_value("magnitude of x after 100 s with B = 2 + t/2, which satisfies (4.7)", v["slow"],
@@ -257,7 +259,7 @@ def evaluate_path_bounds(samples: Sequence[Sample]) -> Evaluation:
     The stiffness of the paths switches at random between these bounds (Zhu 1994, Figs 4.28, 4.29).
     """
     return Evaluation((
-        check_deterministic_value("largest distance by which a path lies outside",
+        check_deterministic_value("largest distance by which a path leaves the region between curves 1 and 2",
                     float(collect_values(samples, "outside").max()), (0.0, 1e-3),
                     "error of the interpolation between steps of 1 ms"),
     ))  # fmt: skip
@@ -307,7 +309,7 @@ def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
     """
     v = samples[0].values
     return Evaluation((
-        check_deterministic_value("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
+        check_deterministic_value("largest B^2 - 4 M K_max of all axes, with and without hand", v["margin"],
                     (-np.inf, -1e-9), "no translational axis satisfies (4.14)", unit="(N s/m)^2"),
         check_deterministic_value("largest growth per half swing with the worst switching", v["growth"],
                     (0.0, 1.0 - 1e-9), "below 1 the motion decays for any change of stiffness"),
@@ -359,7 +361,7 @@ def evaluate_pose_resolution(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation((
         check_deterministic_value("standard deviation of the position", v["translation"], (0.0, 1.0), reason,
                     unit="um", published=1.0),
-        check_deterministic_value("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
+        check_deterministic_value("standard deviation of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
                     published=1e-3),
     ), note="three beams on photodiodes with steps of 1 um")  # fmt: skip
 

@@ -272,7 +272,7 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
 def _evaluate_table(row: str, samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     check = check_deterministic_value(
-        "entries that differ from the printed values", values[f"{row}: differ"], (0.0, 0.0),
+        "number of entries that differ from the printed values", values[f"{row}: differ"], (0.0, 0.0),
         "half of the last printed digit",
     )  # fmt: skip
     note = f"{values[f'{row}: entries']:.0f} entries, largest difference {100 * values[f'{row}: largest']:.2g} %"

@@ -254,7 +254,7 @@ def evaluate_destabilizing_force_error(samples: Sequence[Sample]) -> Evaluation:
     """
     v = samples[0].values
     return Evaluation(
-        (check_deterministic_value("smallest relative error of the force feed-forward that is unstable",
+        (check_deterministic_value("smallest relative error of the force feed-forward that makes the loop unstable",
                      v["limit"], (0.0, 0.05), "5 % is reported to be enough", published=0.05),),
         explanation="the loop is (Z_m + C_m + Z_s + C_s)(Z_h + Z_e) - e Z_h (Z_e - Z_m - C_m): to"
         " destabilize it, e Z_h must be as large as both sides with their controllers; the hand of"
@@ -262,7 +262,8 @@ def evaluate_destabilizing_force_error(samples: Sequence[Sample]) -> Evaluation:
         f" by {v['scale']:.2g}, or the hand's stiffness by {v['hand']:.2g}; gains, hand and task"
         " of the reported system are not in the document. With 5 % the two-port is no longer"
         f" passive (scattering norm {v['norm']:.4f})",
-        note=f"with 5 ms each way {v['late']:.3g}; CAT 215 as the slave {v['machine']:.3g}",
+        note=f"smallest unstable error with a delay of 5 ms each way: {v['late']:.3g}; with the CAT 215 as the slave:"
+        f" {v['machine']:.3g}",
     )  # fmt: skip
 
 
@@ -305,7 +306,7 @@ def evaluate_felt_impedance_extremes(samples: Sequence[Sample]) -> Evaluation:
     v, reason = samples[0].values, "the task is 10^8 times stiffer or softer; 10^-4 remains"
     return Evaluation((
         check_deterministic_value("relative difference from (3.50), stiff task", v["stiff"], (0.0, 1e-4), reason),
-        check_deterministic_value("from (3.51), soft task", v["soft"], (0.0, 1e-4), reason),
+        check_deterministic_value("relative difference from (3.51), soft task", v["soft"], (0.0, 1e-4), reason),
     ))  # fmt: skip
 
 

@@ -133,7 +133,8 @@ def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation((
         check_deterministic_value("largest relative error of the hybrid matrix (3.11)", values["matrix"],
                     ROUNDING_RANGE, reason),
-        check_deterministic_value("of the felt impedance (3.12)", values["felt"], ROUNDING_RANGE, reason),
+        check_deterministic_value(
+            "largest relative error of the felt impedance (3.12)", values["felt"], ROUNDING_RANGE, reason),
     ))  # fmt: skip
 
 
@@ -176,7 +177,8 @@ def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
     """
     values = samples[0].values
     return Evaluation(
-        (check_deterministic_value("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
+        (check_deterministic_value(
+            "largest scattering norm over frequency, smallest value of six delays from 1 ms to 5 s",
                      values["least"], (PASSIVE_NORM, np.inf), "above 1 is not passive (3.6)"),),
         note=f"a lossless line with the same delays has {values['lossless']:.3g}",
     )  # fmt: skip
@@ -216,7 +218,9 @@ def evaluate_nyquist_agreement(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     return Evaluation((
         check_deterministic_value(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
-                    " gains) in which the criterion and a simulated kick agree", values["fraction"],
+                    " gains) "
+                "in which the stability criterion and the simulated response to a kick (initial velocity) "
+                "agree", values["fraction"],
                     (1.0, 1.0), "the criterion is necessary and sufficient"),
     ))  # fmt: skip
 
@@ -319,8 +323,8 @@ def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
         (check_mean("position error due to contact over the RMS noise of the measured"
                     " position", collect_values(samples, "ratio"), (-np.inf, 1.0),
                     "smaller than the noise"),),
-        note=f"{format_values(samples, 'shift', 1e3)} mm with"
-        f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
+        note=f"position error {format_values(samples, 'shift', 1e3)} mm with a contact force of"
+        f" {format_values(samples, 'force', 1e-3)} kN; RMS noise {format_values(samples, 'noise', 1e3)}"
         " mm, from the angle sensors of khoshzaban1992",
     )  # fmt: skip
 
@@ -370,13 +374,14 @@ def evaluate_rate_force_margin(samples: Sequence[Sample]) -> Evaluation:
     ratio = v["rate"] / v["position"]
     return Evaluation(
         (
-            check_deterministic_value("largest stable factor of the reflected force under rate control, without"
-                        " delay", v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
+            check_deterministic_value(
+                "largest factor on the reflected force that is stable under rate control, without delay",
+                v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
                         " reflection, 450 N in the hand for 25 kN, counts as no limit"),
-            check_deterministic_value("the same over that of position control", ratio, (0.0, 1.0 - 1e-9),
+            check_deterministic_value("this factor over that of position control", ratio, (0.0, 1.0 - 1e-9),
                         "rate control is less stable"),
         ),
-        note=f"with 20 ms each way {v['late_rate']:.2f} under rate control,"
+        note=f"largest stable factor with 20 ms each way: {v['late_rate']:.2f} under rate control,"
         f" {v['late_position']:.2f} under position control: with delay position control is less"
         " stable at these gains",
     )  # fmt: skip
@@ -390,8 +395,9 @@ def evaluate_position_force_margin(samples: Sequence[Sample]) -> Evaluation:
     """
     v = samples[0].values
     return Evaluation(
-        (check_deterministic_value("largest stable factor of the reflected force under position control, 20 ms"
-                     " each way", v["late_position"], (1e-9, 1.0 - 1e-9),
+        (check_deterministic_value(
+            "largest factor on the reflected force that is stable under position control, delay of 20 "
+                "ms each way", v["late_position"], (1e-9, 1.0 - 1e-9),
                      "unstable with the shipped gain, stable with a smaller gain"),),
         note=f"without delay: {v['position']:.3g}",
     )  # fmt: skip
@@ -456,7 +462,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         '"It can be shown that the standard method of communicating forces and velocity between the'
         ' master and slave in a teleoperator system leads to a nonpassive system for any time'
         ' delay."', "p. 28, Eq. 3.8", evaluate_delayed_channel, {"wave_impedance": 1.0},
-        "a lossless line instead of the delayed channel",
+        "a lossless line instead of the delayed channel; its norm is exactly 1, and only a norm "
+                "above 1 agrees",
     )),
     make_deterministic_experiment("Nyquist criterion", compare_nyquist_with_simulation, make_claim(
         "closed-loop stability by the loop transfer functions",
@@ -486,7 +493,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ), make_claim(
         "stiffness adjustment",
         "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8",
-        "p. 51, Fig. 4.24", evaluate_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
+        "p. 51, Fig. 4.24", evaluate_stiffness_law, {"pilot.reflection": "none"}, "no force reflection",
         "input",
     )), max_repetitions=6),
     make_deterministic_experiment("direct force, linear", compute_direct_force_margins, make_claim(

@@ -821,13 +821,13 @@ def _laws(data: Dataset, patched: Machine, noise: np.ndarray):
 def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect], unknown):
     if verdict == "unknown" and unknown:
         place = unknown.channel.partition(".")[2] or "supply"
-        return next_experiment(machine, "no known effect explains the data", [(unknown.law, place)])
+        return next_experiment(machine, "no known effect explains the data.", [(unknown.law, place)])
     unsure = [e for e in named if e.probability < SURE]
     if verdict not in ("ambiguous", "named") or not unsure:
         return None
     pairs = [(e.name, e.location) for e in unsure]
     pairs += [(a.name, a.location) for e in unsure for a in e.alternatives]
-    return next_experiment(machine, "these data do not distinguish the effects", pairs)
+    return next_experiment(machine, "these data do not distinguish the effects.", pairs)
 
 
 def _jitter(data: Dataset, levels: Levels) -> tuple[float, float]:

@@ -58,6 +58,22 @@ def test_judgement_needs_all_checks():
     assert Evaluation((good,), unavailable="the text ends").verdict == "cannot be computed"
 
 
+def test_cells_number_the_quantities_and_name_those_outside():
+    checks = tuple(check_deterministic_value(name, value, (0.0, 2.0), "two", unit="m")
+                   for name, value in (("a", 1.0), ("b", 3.0), ("c", 4.0), ("d", 5.0)))  # fmt: skip
+    row = Comparison("x", "p. 1", "", "document", Evaluation(checks, "wear", "more"))
+    assert (
+        row.format_simulated_cell() == "(1) a = 1 m<br>(2) b = 3 m<br>(3) c = 4 m<br>(4) d = 5 m<br>In addition: more"
+    )
+    assert row.format_criterion_cell() == "(1) to (4): 0 to 2 m (two)<br>Outside: (2) to (4)<br>Reason: wear"
+    assert row.format_criterion_cell(only_ranges=True) == "(1) to (4): 0 to 2 m<br>Outside: (2) to (4)"
+    single = row._replace(evaluation=Evaluation(checks[:1], "wear"))
+    assert (single.format_simulated_cell(), single.format_criterion_cell()) == (
+        "a = 1 m",
+        "0 to 2 m (two)<br>Note: wear",
+    )
+
+
 @pytest.mark.nightly
 def test_intervals_cover_the_truth():
     """Of 100 intervals 95 should: the binomial standard error is 2.2 %, and three are allowed.

@@ -26,9 +26,11 @@ def main() -> None:
     asked = options(__doc__, task="TrackTrajectory", turns=5, seconds=1.0, loop=64, processes=16, batch=1024)
     name = f"hydrotele/{asked.task}-v0"
     text = [
-        "Speed and memory of the batched environments, compared with the vector environments of"
-        f" gymnasium. Task {asked.task}, valve actions, real sensors,"
-        f" {multiprocessing.cpu_count()} cores.\n"
+        "How fast are the environments, and how much memory do they need? For training, `gymnasium.make_vec` "
+        "can make one object that simulates many environments at once (batched). It is compared with "
+        "gymnasium's own vector environments, which step single environments in a loop (`Sync`) or in "
+        f"processes (`Async`). Task {asked.task}, valve actions, real sensors, {multiprocessing.cpu_count()} "
+        "cores.\n"
     ]
     text += ["## Physics steps per second, with hydraulics and sensors\n", *_ways(name, asked)]
     text += ["\n## Cost by batch size\n", *_sizes(name, asked)]
@@ -38,10 +40,12 @@ def main() -> None:
 
 def _ways(name: str, asked) -> list[str]:
     lines = [
-        f"A batch has {asked.batch} environments, `Sync` {asked.loop}, `Async` {asked.processes}.",
-        "Larger is better. `Physics alone` is MuJoCo's `mujoco.batch.Batch` with two threads on the same",
-        "model and commands, without control, sensors and reward. The batched environments have their own",
-        "loop over `mj_step` and may be faster than `Batch`.",
+        "Physics steps of 1 ms per second of time, larger is better. Each row is one control rate; at a "
+        f"lower rate, more physics steps follow from one call. The batch has {asked.batch} environments, "
+        f"`Sync` {asked.loop}, `Async` {asked.processes}. `Physics alone` is MuJoCo's `mujoco.batch.Batch` "
+        "with two threads on the same model and commands, without control, sensors and reward: about what is "
+        "possible at most. The batched environments have their own loop over `mj_step` and may be faster. "
+        "The last three columns are ratios; above 1 the first is faster.",
         "",
         "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
         "| Async | physics alone | batched / Sync | batched / Async | physics alone / Sync |",

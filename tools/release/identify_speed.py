@@ -112,9 +112,11 @@ def main() -> None:
     asked = options(__doc__, minutes=60.0)
     log = run_scenario(load_scenario("excitation", {"duration": str(60 * asked.minutes)})).measured
     lines = [
-        "Time and memory of `hydrotele identify` for growing length of a CAT 215 log at 50 Hz, one"
-        " process per log. Smaller is better. Each time is from a single run, so that rows can be compared only"
-        " roughly.", "",
+        "How long does `hydrotele identify` take for long logs? Each row is a CAT 215 log of this length at "
+        "50 Hz in its own process; smaller is better. Each time is from a single run, so that rows can be "
+        "compared only roughly. 'Identification' is the computation alone, 'whole process' includes start "
+        "and reading.",
+        "",
         "| log [min] | identification [s] | whole process [s] | peak memory [MB] |",
         "| ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
@@ -123,8 +125,10 @@ def main() -> None:
             lines.append(f"| {minutes:g} | {seconds:.1f} | {whole:.1f} | {memory:.0f} |")
     lines += [
         "",
-        "The Pinocchio regressor below has the columns of the spanning tree only, without"
-        " projection on the drives and without friction.",
+        "A main step builds the regressor, the matrix that relates parameters to forces. The next table "
+        "compares its time per row of the log with Pinocchio, a library for robot dynamics. Pinocchio's row "
+        "does less work: it has the columns of the tree without closed loops, without projection on the "
+        "drives and without friction.",
         "",
         "| regressor, 20 000 rows | us per row |",
         "| --- | ---: |",

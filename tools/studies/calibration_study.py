@@ -88,9 +88,12 @@ def mukca(asked: argparse.Namespace) -> str:
     heldout = np.array([t.heldout for t in trials])
     tip = np.array([t.tip for t in trials])
     lines = [
-        f"{many} robots `{asked.robot}`, 4 places x 2 sockets x {asked.rows} postures, ball play"
-        f" {1e3 * asked.play:g} mm, encoders {1e6 * asked.encoder:g} urad,"
-        f" {'one set of errors' if asked.same else 'new errors for every seed'}.", "",
+        "This study asks whether the reported intervals are right."
+        f" {many} simulated `{asked.robot}` robots with {'the same' if asked.same else 'random'}"
+        " errors are calibrated. The standard deviations of the errors are: lengths 0.3 mm, tilts 1 mrad, "
+        "joint offsets 3 mrad, ball 2 mm."
+        f" Each is measured at 4 places with 2 sockets and {asked.rows} postures, with a ball play of"
+        f" {1e3 * asked.play:g} mm and encoder noise of {1e6 * asked.encoder:g} urad.", "",
         "| intervals of | number | contain the true value [%] |", "| --- | ---: | ---: |",
         f"| identifiable parameters | {full.sum()} | {100 * inside[full].mean():.1f} |",
         f"| parameters identifiable only in combinations, split by the prior (not reported) |"

@@ -54,17 +54,13 @@ WINDOWS = {"free, lowering": (1.0, 2.5), "pressed, at rest": (5.5, 8.0),
 LIMITS = (
     "## Limits",
     "",
-    "- The 95 % intervals assume white errors and are too narrow: the remaining errors come from "
-    "inertia and the shape of friction.",
+    "- The 95 % intervals of the static model are too narrow. They assume independent errors, but the "
+    "remaining errors come from inertia and the shape of friction.",
     "- About two thirds of the remaining false force come from the noise of the pressures. The "
     "rest is friction of motions too slow to be distinguished from rest.",
     "- A faster estimate has a larger false force. On `zhu_up` the dynamic estimate is worse "
     "than the static one at 3 and 6 Hz and above.",
-    "- A disturbance observer had 10 N with ideal sensors, but 240 and 440 N on `zhu_up` and "
-    "`zhu_out` with real ones at 1 Hz (earlier version). In its model, pressure noise of "
-    "25 psi moves the light bucket faster than the velocities over which friction changes sign. At "
-    "rest, the model's own friction hides a force. Kalman gains gave 260 to 400 N.",
-    "- A friction model of creep, visible only after longer averaging, gave no improvement.",
+    "- A disturbance observer and a friction model of creep gave no improvement.",
     "",
 )
 
@@ -264,17 +260,22 @@ def parameters(results: list[dict]) -> list[str]:
     shown = ", ".join(f"{v:.0f}" for v in exact.residual)
     return [
         "## Static model", "",
-        "Parameters of `tau = Y(q) P` from `scenarios/slow_moves.yaml` with the machine's "
-        "sensors, by recursive least squares. C2, S2, C23, ... are the factors of the cosine and sine "
-        "of the sums of the joint angles 2 (boom), 3 (stick) and 4 (bucket). Links alone, all masses: "
-        "computed from the masses of the links, without and with those of tubes and rods. Identified: "
-        "with a Coulomb friction of every drive "
-        "as a further parameter. Friction ignored: with friction left in the torques, as in "
-        "Zhu's work.",
+        "The static estimator computes the joint torques of gravity as `tau = Y(q) P`: Y depends on the "
+        "joint angles q, and P has the six gravity parameters of the table. C2 and S2 are the factors of the "
+        "cosine and sine of joint angle 2 (boom). C23 and S23 belong to the sum of angles 2 and 3 (stick). "
+        "C234 and S234 also include angle 4 (bucket). This table tests whether slow motions "
+        "(`scenarios/slow_moves.yaml`, the machine's sensors) identify P. Columns:",
+        "",
+        "- links alone, all masses: true values, computed from the masses of the links, without and with "
+        "those of cylinder tubes and rods;",
+        "- identified, 95 % interval: estimate by recursive least squares, with a Coulomb friction of every "
+        "drive as a further parameter;",
+        "- worst error of a trial: largest difference from \"all masses\";",
+        "- friction ignored: the same error if friction is left in the torques, as in Zhu's work.",
         "", *lines, "",
-        f"Largest error: {100 * error / largest:.2f} % of the largest parameter. The cylinders "
-        f"and the bucket linkage leave {shown} N m (boom, stick, bucket) that no parameters can "
-        "represent.",
+        f"The largest error is {100 * error / largest:.2f} % of the largest parameter. {shown} N m (boom, "
+        "stick, bucket) of the torques of cylinders and bucket linkage cannot be represented by these "
+        "parameters.",
         "",
     ]  # fmt: skip
 
@@ -284,11 +285,12 @@ def free_motion(results: list[dict]) -> list[str]:
     said = {IDEAL: "ideal", REAL: "real", "friction": f"real, boom's friction x {WIDER}"}
     lines = [
         "## False force in free motion", "",
-        "RMS of the force at the tip (r, theta over the radius, z) that is estimated where there "
-        f"is none, over {len(results)} seeds, from {SETTLED:g} s on. Ratio: dynamic over static, "
-        "mean and worst seed. `zhu_*` are slow straight lines between rests, `excitation*` fast "
-        "motions of all axes. The last kind of sensors stands for a machine that differs from "
-        "its model.",
+        "How large is the estimated force at the tip in free motion, where the true force is 0? The force "
+        f"has the components r, theta (torque over the radius) and z; cells are its RMS over {len(results)} "
+        f"seeds, from {SETTLED:g} s on. Ratio: dynamic over static; below 1 the dynamic estimator is better. "
+        "`zhu_*` are slow straight lines between rests, `excitation*` fast motions of all axes. Sensors: "
+        f"ideal (without error), real, and real with {WIDER} times the boom's friction, as an example of a "
+        "machine that differs from its model.",
         "",
         "| motion | sensors | static [N] | dynamic [N] | ratio, mean | ratio, worst |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
@@ -307,7 +309,9 @@ def bands(results: list[dict]) -> list[str]:
     """Table of false forces over the bandwidth of the filters."""
     lines = [
         "## Bandwidth", "",
-        "False force with the machine's sensors and other bandwidths of the slow and the fast filter.",
+        "How does the bandwidth change the false force in free motion? A faster estimate has less delay but "
+        "a larger false force. Each row is one choice of the slow and the fast filter, with the machine's "
+        "sensors.",
         "",
         "| slow, fast [Hz] | delay [s] | zhu_up: static, dynamic [N] |"
         " excitation: static, dynamic [N] |",
@@ -327,9 +331,11 @@ def ways(results: list[dict]) -> list[str]:
     """Table of other estimates."""
     lines = [
         "## Alternative estimators", "",
-        "False force of the dynamic estimate with the machine's sensors [N], all with the same "
-        "delay: one filter for all signals; a generalised-momentum observer; the two filters. "
-        "With one slow filter, the friction of the filtered rate differs from the filtered friction.",
+        "Could a simpler or another estimator do the same? Cells: false force in free motion of the dynamic "
+        "estimate with the machine's sensors [N], all with the same delay; smaller is better. One filter: "
+        "all signals pass one slow filter; friction computed from a filtered rate then differs from filtered "
+        "friction. Momentum observer: the generalised-momentum observer of robotics. Two filters: the "
+        "estimator of this page.",
         "",
         "| motion | one filter | momentum observer | two filters |",
         "| --- | ---: | ---: | ---: |",
@@ -345,9 +351,11 @@ def contact(results: list[dict]) -> list[str]:
     """Table of errors in contact."""
     lines = [
         "## Contact with the ground", "",
-        "The bucket is pressed on the ground, held, then dragged towards the machine. RMS of the "
-        "error against the simulator's contact force. Filtered: against that force through the "
-        "filters of the estimate, the best that the estimate can reach.",
+        "How large is the error while the bucket touches the ground? The bucket is lowered, pressed on the "
+        "ground, held, then dragged towards the machine and lifted. Each row is one part of this motion. "
+        "True force: RMS of the simulator's contact force. The next two columns are the RMS error of the "
+        "estimate against it. Most of it is the delay of the filters. The last two columns compare with the "
+        "true force passed through the same filters: this is the error of the estimator itself.",
         "",
         "| part | sensors | true force [N] | static [N] | dynamic [N] |"
         " static, filtered [N] | dynamic, filtered [N] |",
@@ -389,18 +397,25 @@ def report(results: list[dict]) -> str:
     """The whole result in Markdown."""
     took = cost()
     lines = [
-        "The force at the tip is estimated from cylinder pressures with a static and a dynamic "
-        "model, and compared with the force in the simulation. Such an estimate needs no force "
-        "sensor. Errors: lower is better.",
+        "Can the contact force at the tip be computed from cylinder pressures, without a force sensor? Two "
+        "estimators are compared with the true force of the simulated CAT 215. The static estimator "
+        "subtracts gravity only; the dynamic one also subtracts inertia and friction. In free motion, where "
+        "the true force is 0, the dynamic one is wrong by about 0.2 kN and the static one by 1 to 6 kN. Use "
+        "the dynamic one for moving machines.",
         "",
-        "A fast filter gives positions, rates, accelerations and pressures with equal delay; the force that follows "
-        f"from them passes a slow filter. Slow {FORCE_BANDWIDTH_HZ:g} Hz and fast {MOTION_BANDWIDTH_HZ:g} Hz unless "
-        "stated otherwise, with a delay of "
-        f"{filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ):.2f} s. One update takes "
-        f"{took[0]:.0f} us (static) and {took[1]:.0f} us (dynamic).",
+        "All errors are RMS values; smaller is better. A fast filter gives positions, rates, accelerations "
+        "and pressures with equal delay, and the force computed from them passes a slow filter. Their "
+        f"bandwidths are {MOTION_BANDWIDTH_HZ:g} Hz (fast) and {FORCE_BANDWIDTH_HZ:g} Hz (slow) unless stated "
+        "otherwise, with a delay of "
+        f"{filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ):.2f} s in all. One update "
+        f"takes {took[0]:.0f} us (static) and {took[1]:.0f} us (dynamic) of computing time.",
         "",
         *parameters(results),
         "![Convergence](endpoint_force.png)", "",
+        "Convergence of the six parameters with the number of equations (readings of slow motion) used. "
+        "Blue: estimate; dashed: true value 'all masses'. A good estimate reaches the dashed line and stays "
+        "there; the remaining distance is the error in the table.",
+        "",
         *free_motion(results), *ways(results), *bands(results), *contact(results),
         *LIMITS,
     ]  # fmt: skip

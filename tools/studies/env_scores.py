@@ -21,22 +21,52 @@ from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from tools.studies.study import options, publish
 
-HEAD = """The reference controller, zero actions and random actions run in every control task, with
-ideal and real sensors. The scores are the baseline for learned controllers. Tasks, rewards and
-terminations: [environments](../environments.md).
+HEAD = """A learned controller should be compared with these scores. Three simple controllers run in every control task:
+`reference` (a hand-written controller), `zero` (no action) and `random` (random actions). A useful controller
+is far better than `zero` and `random`; a good one reaches `reference`. The reference nearly always succeeds on
+nominal machines. On randomised machines its errors are mostly larger, so a learned controller can be better
+there. Tasks, rewards and the ends of episodes: [environments](../environments.md).
 
-All controllers run the same episodes (same seeds and machines). Cells are mean ±
-standard error over the episodes. A larger return, `success` and `contact` are better; a smaller
-error (RMS) is better. `final` is the fraction of episodes in which the condition holds at the end;
-`overload`, `off_plate` (the tip is no longer over the plate) and `spoiled` are failures. `soil` is the index of
-the soil (0 soft, 1 loamy, 2 firm); it shows which soils the episodes had.
+Each table is one task. A row is one combination of:
 
-The `reference` controller uses the nominal machine and the observation. Randomised machines have
-the effects of `hydrotele.envs.variants.typical_variation`: valve overlap, flow and bandwidth,
-Coulomb friction, oil stiffness, command delay, payload.
+- actions: what the controller commands (`valve` openings, `joint_rate` joint velocities, `resolved_motion`
+  velocities of the tip);
+- sensors: `ideal` (exact) or `real` (with noise and quantisation);
+- machine: `nominal`, or `randomised` with valve overlap, flow and bandwidth, Coulomb friction, oil stiffness,
+  command delay and payload that differ between machines (`hydrotele.envs.variants.typical_variation`);
+- controller. All controllers run the same episodes (same seeds and machines). The reference knows the nominal
+  machine and the observation only.
+
+Cells are mean ± standard error over the episodes, with the unit in brackets ([1] has no unit):
+
+- return: sum of rewards, larger is better; `success`: fraction of successful episodes, larger is better;
+- a name with RMS: root mean square over an episode. It is an error where the name says error or distance
+  (smaller is better), otherwise a description of the episode, such as `soil` (0 soft, 1 loamy, 2 firm);
+- a name with `final`: fraction of episodes in which the condition holds at the end. `contact` is good;
+  `overload`, `off_plate` (the tip has left the plate) and `spoiled` (the bucket went too far below the target
+  plane) are failures; `held` is 1 if the log is still in the grapple.
 
 Limit: all machines are simulated; randomised scores hold for this distribution only.
 """
+
+TASK_LINES = {
+    "TrackTrajectory": "All axes of an excavator follow moving references. `tip_error`: distance of the tip from its "
+    "reference.",
+    "StraightLine": "The tip of the bucket moves along a straight line. `cross_track_error`: distance from the line; "
+    "`along_track_error`: distance ahead or behind along it; `attitude_error`: error of the bucket's "
+    "angle.",
+    "HoldForce": "The bucket presses on a plate with a given force of 10 to 35 kN. `force_error`: difference from it; "
+    "`contact`: the bucket touches the plate; `overload`: more than 100 kN.",
+    "ReachFeller": "A feller-buncher moves its head to a pose. `distance` and `attitude_error`: remaining distance and "
+    "angle.",
+    "Grade": "A bucket cuts a low bank of soil down to a plane. `profile_rms`: error of the profile; "
+    "`carried_mass`: soil in the bucket; `soil_force`: force of the soil.",
+    "PlaceLog": "A grapple picks up a log and lays it down at a goal. `log_distance` and `yaw_error`: from log to "
+    "goal; `swing_angle`: of the freely swinging grapple.",
+    "LoadTruck": "An excavator fills a truck with soil. Volumes are loaded into the truck, carried in the bucket, "
+    "spilled, and removed from the bank; `energy`: hydraulic; `truck_force`: contact with the truck; "
+    "`loads`: bucket loads.",
+}
 
 
 def names(scores: Scores) -> list[str]:
@@ -59,7 +89,7 @@ def row(cells: list[str]) -> str:
 def table(name: str, asked) -> list[str]:
     """Lines of the table of a task."""
     task = TASKS[name]
-    lines = [f"\n## {name}\n"]
+    lines = [f"\n## {name}\n", *([TASK_LINES[name], ""] if name in TASK_LINES else [])]
     spread = typical_variation(load_machine(task.machine, task.tool))
     actions = asked.actions.split(",") if asked.actions else [task.action]
     columns: list[str] = []

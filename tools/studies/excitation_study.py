@@ -95,23 +95,40 @@ def main() -> None:
     both = sorted(set(stds[0]) & set(stds[1]))
     ratios = {name: stds[0][name] / stds[1][name] for name in both}
     text = "\n".join([
-        f"A designed motion is compared with the scenario `{OLD}`, a Fourier motion as in"
-        " Khoshzaban 1992. Both are simulated for 60 s with the sensors of the CAT 215. The design"
-        f" maximises the information on {len(base)} base parameters, those that a random motion determines"
-        f" despite the sensor noise; {asked.harmonics} harmonics, {asked.starts} starts. The designed motion"
-        " determines further ones. The number of base parameters without noise is larger"
-        " ([identifiability](identifiability.md)). A"
-        " smaller standard deviation is better; a ratio above 1 favours the designed motion.", "",
-        "| | |", "| --- | ---: |",
-        f"| ratio of the determinant criterion per parameter, designed to `{OLD}` | {better:.1f} |",
-        f"| largest utilisation of a limit by the designed motion | {100 * new.max_utilisation:.0f} % |",
-        f"| parameters identifiable with both motions | {len(both)} |",
-        f"| parameters identifiable with `{OLD}` / with the designed motion |"
+        "Which motion should a machine perform so that its masses and friction can be identified best? This "
+        f"study compares a designed motion with the scenario `{OLD}`, whose axes move as sums of sines as in "
+        f"Khoshzaban 1992. The designed motion determines {len(stds[1])} instead of {len(stds[0])} "
+        "parameters. For the parameters that both determine, its standard deviation is "
+        f"{np.median(list(ratios.values())):.2f} times smaller (median).",
+        "",
+        f"Both motions are simulated for 60 s with the sensors of the CAT 215 in {asked.trials} trials. The "
+        f"design varies the amplitudes and phases of {asked.harmonics} harmonics and keeps the limits of "
+        f"joint range, stroke, flow and pressure; it starts from {asked.starts} random motions. It maximises the "
+        "determinant of the information matrix, that is, it minimises the volume of the joint confidence "
+        f"region (D-optimal design). The criterion counts {len(base)} [base parameters](../terms.md): those "
+        "that a random motion determines despite the sensor noise. More are determined by logs without noise "
+        "([identifiability](identifiability.md)).",
+        "",
+        "| quantity | value |", "| --- | ---: |",
+        f"| information per parameter, designed motion relative to `{OLD}` (root of the determinants' ratio) |"
+        f" {better:.1f} |",
+        "| largest use of a limit (joint range, stroke, flow, pressure) by the designed motion |"
+        f" {100 * new.max_utilisation:.0f} % |",
+        f"| parameters determined by both motions | {len(both)} |",
+        f"| parameters determined by `{OLD}` / by the designed motion |"
         f" {len(stds[0])} / {len(stds[1])} |",
-        f"| interval width, `{OLD}` to designed motion, median ratio | "
+        f"| standard deviation of a parameter, `{OLD}` over designed motion, median | "
         f"{np.median(list(ratios.values())):.2f} |", "",
-        "Parameters are in SI units; `boom_rod` and `stick_rod` are the boom and stick cylinders, `offset` is a"
-        " constant force of a drive.", "",
+        "The first two rows describe the design: information above 1 favours the designed motion, and the "
+        "use of a limit must not exceed 100 %. In the last row, a value above 1 favours the designed motion.",
+        "",
+        "A parameter is a mass property or a friction coefficient of a link or drive, in SI units. "
+        "`boom_rod` and `stick_rod` are the cylinders of boom and stick. `inertia_xy` is an element of the "
+        "inertia matrix, and `moment_x` is mass times the x coordinate of the centre of mass. `coulomb` is "
+        "dry friction, `stribeck` additional dry friction near zero speed, and `viscous` friction per speed. "
+        "`offset` is a constant force of a drive. Std: standard deviation of the estimate, smaller is "
+        "better. Ratio: first std over second; above 1 the designed motion is better.",
+        "",
         "| parameter | std, `excitation` | std, designed | ratio |",
         "| --- | ---: | ---: | ---: |",
         *(f"| {n} | {stds[0][n]:.3g} | {stds[1][n]:.3g} | {r:.2f} |" for n, r in ratios.items()),

@@ -164,13 +164,21 @@ def main() -> None:
         save_machine(better, folder / "identified" / "machine.yaml")
         models = [None, *(str(folder / name) for name in ("given", "identified", "driven"))]
         lines = [
-            "A controller adds the forces of an inverse dynamics model to joint feedback (after"
-            " Abdellatif 2008, Figs 10 to 12). Swing, boom and stick of the CAT 215 with a force"
-            " drive on each joint follow a path. The machine differs in masses and friction from"
-            " the given model. The identified model comes from a log of the same machine.", "",
-            "Cells are RMS distances of the tip from its reference after the start in mm; smaller"
-            " is better.", "",
-            "| path | lap [s] | no model [mm] | given model | identified model | exact model |",
+            "How much does an identified model improve the control of a path? A controller adds the drive "
+            "forces that an inverse dynamics model predicts (feedforward) to joint feedback, after "
+            "Abdellatif 2008, Figs 10 to 12. With the identified model the tip follows its path 13 to 42 "
+            "times more accurately than with the given model.",
+            "",
+            "Swing, boom and stick of the CAT 215 with a force drive on each joint (no hydraulics) follow a "
+            "circle and a square. The simulated machine differs in masses and friction from the given model. "
+            "The identified model was fitted to a log of the same machine; the exact model has the true "
+            "parameters.",
+            "",
+            "Cells are RMS distances of the tip from its reference after the start in mm; smaller is better. "
+            "Lap: time for one round; a shorter lap is faster.",
+            "",
+            "| path | lap [s] | feedback alone, no model [mm] | given model [mm] | identified model [mm] |"
+            " exact model [mm] |",
             "| --- | ---: | ---: | ---: | ---: | ---: |",
         ]  # fmt: skip
         for shape in ("circle", "square"):

@@ -214,61 +214,81 @@ def draw(bare: list, path: Path) -> None:
 def report(bare, shipped, sides, cases, late, kept, asked: argparse.Namespace) -> str:
     factor = [one[3] / one[0] for one in bare if 0.0 < one[3] < np.inf]
     return "\n".join([
-        "Force reflection under rate control becomes unstable above a limit. The linear "
-        "prediction of this limit is compared with simulations, and direct force with stiffness "
-        "feedback. The CAT 215 presses its bucket on a plate. Ratio: hand force per machine "
-        "force, in 1e-5. A run is unstable if the true contact force swings by more than "
-        f"{100 * SHARE:.0f} % of the target of {TARGET / 1e3:g} kN. The swing is half the 5 to 95 "
-        "% range in the last third of the run.",
-        "", "![Limits and contact forces](force_reflection.png)", "",
-        "Left: limits of the first table without dead bands, simulated against predicted; the line marks equal values. "
-        f"Right: contact force with the target of {TARGET / 1e3:g} kN (dotted), dead bands and the reference setting; "
-        f"`press_direct` has the ratio {1e5 * PICTURE_RATIO:g}.",
-        "", "## Direct force under rate control: predicted and simulated limit", "",
-        "Settings: speed of the tip along z with the handle at its stop, stiffness of the plate, delay of the channel, "
-        "bandwidth of the force estimate. The reference is the first row; each other row changes one setting.",
-        "", *limits_table(bare, shipped), "",
-        "Predicted: `hydrotele analyse teleop`, from the same parameters as the simulation, with "
-        "the frequency of the oscillation at the limit. No "
-        "dead bands: those of joystick and valves are zero, with ideal sensors and the same "
-        "speed per displacement. This is the case that a linear loop describes. Simulated over "
-        f"predicted (1 is best): {min(factor):.2f} to {max(factor):.2f}, median "
-        f"{np.median(factor):.2f}.",
+        "This study is for engineers who choose the gain of force reflection. The CAT 215 presses its bucket "
+        "on a plate under [rate control](../terms.md): the joystick's deflection sets the velocity of the "
+        "tip. Two ways to let the operator feel the contact are compared. Direct force applies the scaled "
+        "machine force to the joystick; stiffness feedback makes the joystick's centring spring stiffer "
+        "instead.",
         "",
-        "Dead bands: 1.5 mm at the joystick, overlap of the valves, with the sensors of Khoshzaban 1992, as in "
-        "the shipped scenarios. "
-        "Both limits are the geometric mean of the last stable and the first unstable ratio. The "
-        f"ratios are a ladder with steps of 1.25 from {LADDER[0]:g} to {LADDER[-1]:.0f} times the "
-        "linear prediction for the settings of the column. With dead bands this prediction is not listed and a few "
-        "per cent smaller than the listed one. Each limit comes from one run per ratio. With dead bands, whether a run "
-        "near its limit "
-        "becomes unstable also depends on the seed (sensor noise, operator), as the next table shows.",
-        "", "## Stiffness feedback with the same reflection", "",
-        f"Direct force has the ratio {small(sides[0][2])}. With it, both structures give the same "
-        "force in the hand at the edge of the dead band. Both have the dead band and real sensors. Swing: lower is "
-        "better.",
+        "Results: the linear prediction of the largest stable gain (`hydrotele analyse teleop`) is on the "
+        f"safe side: the simulated limit is {min(factor):.2f} to {max(factor):.2f} times as large. At the "
+        "same felt force, direct force is unstable in some runs of most settings. Stiffness feedback is "
+        "stable in every run, also with delays up to 150 ms.",
+        "",
+        "Words used below. Ratio: gain of direct force, hand force per machine force, printed in units of "
+        f"1e-5. Target: the contact force of {TARGET / 1e3:g} kN that the simulated operator tries to hold. "
+        "Swing: half the range between the 5th and 95th percentile of the true contact force in the last "
+        "third of a run, relative to the target; smaller is better. A run counts as unstable if the swing "
+        f"exceeds {100 * SHARE:.0f} %.",
+        "",
+        "![Limits and contact forces](force_reflection.png)",
+        "",
+        "Left: largest stable ratio, simulated (vertical) against predicted (horizontal), one point per "
+        "setting of the first table, without dead bands. Points on the line mean a perfect prediction; "
+        "points above it mean that the prediction is cautious. Right: contact force over time in the "
+        "reference setting with dead bands; dotted: target. With direct force (`press_direct`, ratio "
+        f"{1e5 * PICTURE_RATIO:g}) the bucket bounces between 0 and 70 kN: unstable. With stiffness feedback "
+        "(`press_stiffness`) the force settles near the target: good.",
+        "",
+        "## Direct force: predicted and simulated limit",
+        "",
+        "Each row is one setting. It states what differs from the reference in the first row. This is the "
+        "speed of the tip along z with the handle at its stop, or the stiffness of the plate. It may also be "
+        "the delay of the communication channel, or the bandwidth of the filter that estimates the machine "
+        "force. All limits are ratios in 1e-5. `frequency` is that of the oscillation at the predicted limit.",
+        "", *limits_table(bare, shipped), "",
+        "The first four columns of figures have no dead bands: those of joystick and valves are zero, "
+        "sensors are ideal, and the speed per displacement is the same. This is the case that a linear "
+        f"analysis describes. Simulated over predicted is {min(factor):.2f} to {max(factor):.2f}, median "
+        f"{np.median(factor):.2f}. 1 is perfect; above 1, the prediction is cautious.",
+        "",
+        "The last three columns have the dead bands of the shipped scenarios: 1.5 mm at the joystick, "
+        "overlap of the valves, and the sensors of Khoshzaban 1992.",
+        "",
+        "A simulated limit is the geometric mean of the last stable and the first unstable ratio tried. The "
+        f"ratios tried rise in steps of 1.25 from {LADDER[0]:g} to {LADDER[-1]:.0f} times the linear "
+        "prediction. With dead bands this prediction is not listed and a few per cent smaller than the "
+        "listed one. Each limit comes from one run per ratio. With dead bands, a run near its limit may be "
+        "stable or unstable depending on the seed (sensor noise, operator), as the next table shows.",
+        "",
+        "## Stiffness feedback against direct force",
+        "",
+        f"Direct force has the ratio {small(sides[0][2])}. With it, both methods give the same force in the "
+        "hand at the edge of the joystick's dead band. Both have dead bands and real sensors. Each setting "
+        f"is run with {asked.seeds} seeds.",
         "", *sides_table(sides, asked.seeds), "",
         "## Stiffness feedback with delay", "",
-        "Zhu's theorem 4-2 has the sufficient condition B² > 4 M K_max (mass M, damping B, largest stiffness K_max of "
-        "joystick and hand). B is the damping of the coils plus 8 N s/m of the hand. The published damping of the "
-        f"coils, 60 N s/m, does not meet it; {DAMPED:g} N s/m are chosen to meet it. The published gains are stable "
-        "by the "
-        "[bound on the worst switching](stability.md) between the stiffnesses, with which every change of "
-        "stiffness decays. The handle swings because the operator corrects the force by short "
-        "pushes.",
+        "Does a delay make stiffness feedback unstable? Zhu's theorem 4-2 gives a condition that is "
+        "sufficient for stability: B² > 4 M K_max (mass M, damping B, largest stiffness K_max of joystick "
+        "and hand). B is the damping of the joystick's coils plus 8 N s/m of the hand. The third column is "
+        f"positive where the condition holds. The published damping of 60 N s/m does not meet it; {DAMPED:g} "
+        "N s/m are chosen to meet it. No run is unstable with either. A second, less strict condition, the "
+        "[bound on the worst switching](stability.md) of the stiffness, proves that the published damping is "
+        "stable as well. The handle moves because the operator corrects the force by short pushes.",
         "", *delays_table(cases, late, asked.seeds), "",
-        f"## A force held by feel, `press_stiffness`, {asked.held} seeds", "",
+        f"## Holding a force by feel, `press_stiffness`, {asked.held} seeds", "",
         f"`python tools/studies/force_reflection_study.py --part held --held {asked.held}`", "",
-        "True contact force against the target in the last 6 s before the end of each target. "
-        "Error: lower is better; negative: too little force. The operator knows the nominal "
-        "stiffness and the gain of the stiffness feedback. He feels the stiffness with the error "
-        "of a human hand. [Experiments of Zhu](zhu1994.md) give the result over a population of "
-        "operators.",
+        "How well can an operator hold a force that he only feels as stiffness? The simulated operator knows "
+        "the nominal stiffness and the gain of the stiffness feedback. He feels the stiffness with the error "
+        "of a human hand. Cells: error of the true contact force, relative to the target, in the last 6 s "
+        "before the end of each target; smaller is better, negative is too little force. The last two "
+        "columns count the seeds with an error below 10 %. [Experiments of Zhu](zhu1994.md) give the result "
+        "over a population of operators.",
         "", *held_table(kept), "", "## Limits", "",
-        "- A loop with a dead band always rests inside it. Its limit is the one above which an "
-        "existing swing persists.",
-        "- The prediction with dead band is conservative. It assumes a centred swing from stop "
-        "to stop; pushes off the centre, valve overlap and stops stabilise the loop.",
+        "- A loop with a dead band is always stable for small motions inside it. Its limit is the ratio "
+        "above which an oscillation, once started, does not decay.",
+        "- The prediction with dead band is cautious. It assumes an oscillation of the handle from stop to "
+        "stop around the centre. Pushes off the centre, valve overlap and stops stabilise the loop.",
         "- The theorem's condition is sufficient, not necessary.",
         "- A force held by feel misses the target by more than 10 % in many runs.",
         "",

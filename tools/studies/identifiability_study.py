@@ -18,8 +18,19 @@ def report() -> str:
     """The tables."""
     bases = {said: find_base_parameters("complete", ball) for said, ball in ENDS}
     lines = [
-        "This study counts the identifiable parameters of the CAT 215 (82 parameters) and compares"
-        " them with Table 13 of Khoshzaban 1992. The motion is 300 independent random states.",
+        "Which masses, inertias and friction coefficients of an excavator can be identified from forces and "
+        "motion at all, even without noise? This study counts them for the CAT 215 (82 parameters) and "
+        "compares the counts with Table 13 of Khoshzaban 1992. With the assumptions of the thesis the counts "
+        "are equal. With real pins at the cylinder ends, six fewer combinations can be identified.",
+        "",
+        "A parameter is fully identifiable if its value can be computed. It is linearly identifiable if only "
+        "a sum with other parameters can be computed. It is unidentifiable if it has no effect or only "
+        "repeats the effect of others. The regressor, the matrix that relates the parameters to the drive "
+        "forces, is evaluated in 300 independent random states of motion. Its rank is the number of [base "
+        "parameters](../terms.md), the independent combinations that can be identified. Unidentifiable is 82 "
+        "minus the rank (thesis, p. 100). The last column gives the singular values of the regressor before "
+        "and after the rank, relative to the largest one, with columns scaled to length 1. A large step "
+        "between them means that the rank is certain.",
         "",
         "| cylinder ends | rank | unidentifiable | linearly identifiable |"
         " fully identifiable | singular values at the rank |",
@@ -38,27 +49,26 @@ def report() -> str:
 
 
 TEXT = """\
-- Unidentifiable (thesis, p. 100): 82 minus the rank. These columns are zero or depend linearly on
-  other columns. Linearly identifiable: only a combination is determined.
-- Singular values are those before and after the rank, relative to the largest one, with columns
-  scaled to length 1.
-- All parameters of the swing except Izz (nine parameters) have no effect in both models.
 - The two counts are exact for different assumptions. The thesis assumes spherical joints at the
   cylinder ends and no moment about the cylinder axes (Eq. 4.23).
   `machine_setup(..., ball_joints=True)` is this model and has the 31, 24 and 27 of the thesis.
 - Pins transmit the moment that rotates tubes and rods about the cylinder axes during swing motion.
   Six combinations that Eq. 4.23 separates are then not separable from the inertias of the links.
-- The models differ by the inertia of tubes and rods about their axes, 10 kg m^2 each in Table 13.
-  This is 0.05 % of the swing torque in the simulated motions of the thesis, and zero in the
-  cylinder forces.
+- In practice the difference is small: the models differ by the inertia of tubes and rods about their
+  axes, 10 kg m^2 each in Table 13. This is 0.05 % of the swing torque in the simulated motions of the
+  thesis, and zero in the cylinder forces.
+- Nine of the ten inertial parameters of the swing (all except Izz) have no effect in both models.
 - The regressor with pins agrees with the inverse dynamics of MuJoCo to 1e-8. For both assumptions
   it agrees with the recursion of the thesis (Eqs 4.20 to 4.47), derived independently in
   `tests/experiments/test_khoshzaban_dynamics.py`.
-- The null space does not depend on the random states.
+- The result does not depend on the random states.
+- Names: `moment_x` is mass times the x coordinate of the centre of mass, `inertia_yz` an element of
+  the inertia matrix, `coulomb` a dry friction, `offset` a constant force of a drive. After the dot:
+  `boom_tube`, `boom_rod` are tube and rod of the boom cylinder.
 - Coulomb friction: `boom_rod`, `stick_rod` in the cylinders; `boom`, `stick` in the joints of the
   links; `boom_tube`, `stick_tube` in the pins of the tubes; `boom_pin`, `stick_pin` in the pins of
-  the rods. `offset`: constant force of a drive.
-- Other studies have other counts: [designed excitation](excitation.md) counts parameters that are
+  the rods.
+- Other pages have other counts: [designed excitation](excitation.md) counts parameters that are
   determined despite noise, the [sensor study](sensor_study.md) has the friction of the drives only."""
 
 

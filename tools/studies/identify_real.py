@@ -93,8 +93,8 @@ def panda(real: Path) -> None:
             ("held out: last quarter", (fit, heldout), WIDE),
         ):
             found = identify_with_friction_shapes([learned], judged, setup, Processing(band=band))
-            print(f"  {name}: rank {len(found.motion_identifiability.base)} of {len(found.names)},"
-                  f" {len(found.data_identifiability.base)} identifiable with noise, relative torque error"
+            print(f"  {name}: {len(found.motion_identifiability.base)} base parameters of {len(found.names)},"
+                  f" {len(found.data_identifiability.base)} determined despite noise, torque error"
                   f" {100 * relative(found):.2f} % (below {found.band:.3g} Hz),"
                   f" {found.seconds:.1f} s")  # fmt: skip
 

@@ -76,14 +76,16 @@ def coils_and_sensing() -> list[str]:
     stated = np.array([sensing.translation] * 3 + [sensing.rotation] * 3) / np.sqrt(12.0) * MICRO
     lines = [
         "## Coils and sensing", "",
-        "Condition number of M, the matrix that maps the coil currents to force and torque on the "
-        "flotor, with torques referred to the radius of the coils: "
-        f"{coils.condition:.4f}. The weight of the flotor takes {np.abs(weight).max():.2f} of "
-        f"{coils.max_current:g} A.",
+        "M is the matrix that maps the six coil currents to force and torque on the flotor, with torques divided "
+        f"by the radius of the coils. Its condition number is {coils.condition:.4f}; 1 is the best possible, and "
+        f"Zhu calls M well-conditioned. Carrying the weight of the flotor takes {np.abs(weight).max():.2f} A of "
+        f"the largest current of {coils.max_current:g} A.",
         "",
-        f"Three beams on diodes at {1e3 * diodes.distance:g} mm, read in steps of "
-        f"{1e6 * diodes.step:g} um. The table gives the standard deviation of the pose at the "
-        "centre of the coils (lower is better), compared with rounding to the stated resolution.",
+        "Three light beams of the flotor meet position-sensitive diodes at a distance of "
+        f"{1e3 * diodes.distance:g} mm, which are read in steps of {1e6 * diodes.step:g} um. The table gives the "
+        "standard deviation of the measured pose at the centre of the coils (lower is better). Row \"diodes\": "
+        "computed from the diodes. Row \"stated\": rounding to the resolution that Zhu states, 1 um and 0.001 "
+        "deg. The diodes are at least as accurate as stated.",
         "",
         "| | x [um] | y [um] | z [um] | rx [0.001 deg] | ry [0.001 deg] | rz [0.001 deg] |", "| --- |" + " ---: |" * 6,
         "| diodes | " + " | ".join(f"{v:.2f}" for v in spread) + " |",
@@ -96,10 +98,11 @@ def steps() -> list[str]:
     """Step responses and hovering, with both readings."""
     lines = [
         "## Steps and hovering", "",
-        "No hand; 200 Hz; readings with errors of up to one step, from the rounded pose and from "
-        "the diodes. Deviation from the designed response and motion of the other axes, as "
-        f"fractions of the step ({1e3 * SIZES[0]:g} mm, {np.rad2deg(SIZES[3]):g} deg); largest "
-        "current. Lower is better.",
+        f"Each axis follows a step of {1e3 * SIZES[0]:g} mm or {np.rad2deg(SIZES[3]):g} deg without a hand, "
+        "controlled at 200 Hz. Columns, all lower is better: largest deviation from the designed response, as a "
+        "percentage of the step; cross motion, the largest motion of the other axes, as a percentage; largest "
+        "coil current. The first three columns use readings of the pose rounded to the stated resolution, the "
+        "last three readings of the diodes.",
         "",
         "| axis | deviation [%] | cross motion [%] | current [A] | diodes: deviation [%] |"
         " cross motion [%] | current [A] |", "| --- |" + " ---: |" * 6,
@@ -112,8 +115,10 @@ def steps() -> list[str]:
         lines.append(f"| {name} | {' | '.join(cells)} |")
     lines += [
         "",
-        "The deviation results from the sampling period of 5 ms: a current is held for 5 ms, and a difference of two "
-        "readings is the velocity of 2.5 ms ago.",
+        "The deviation of about 5 % comes from the sampling period of 5 ms. A current is held for 5 ms. The "
+        "velocity is a difference of two readings and therefore 2.5 ms old."
+        " In the next table the handle is held at its "
+        "centre for 10 s (lower is better).",
         "",
         "| hovering for 10 s | largest error of the handle [um] | RMS [um] |"
         " largest rotation [0.001 deg] |", "| --- | ---: | ---: | ---: |",
@@ -161,13 +166,17 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
     worst = [np.max([np.abs(r[k].value - truth) for r in results], axis=0) for k in (0, 1)]
     lines = [
         "## Identification", "",
-        "12 s of six tones per axis between 0.4 and 6 Hz, from readings and currents only. The "
-        f"control assumes a flotor of {GUESS.mass:g} kg with its centre of mass at the coils and "
-        f"2 g m^2 about every axis. Largest current {np.abs(flight.currents).max():.2f} A, "
-        f"largest travel {1e3 * np.abs(flight.pose[:, :3]).max():.1f} mm and "
-        f"{np.rad2deg(np.linalg.norm(flight.pose[:, 3:], axis=1).max()):.1f} deg; condition "
-        f"number of the scaled equations {first.condition:.1f}. Worst errors of {len(results)} "
-        "trials (lower is better).",
+        "The joystick can identify mass, centre of mass and moments of inertia of its flotor from its own "
+        "readings and currents. For this it moves for 12 s with six tones per axis between 0.4 and 6 Hz."
+        " During this motion "
+        f"the control assumes wrong values: {GUESS.mass:g} kg, the centre of mass at the coils, and 2 g m^2 about "
+        "every axis. All parameters are found within their intervals. Largest current "
+        f"{np.abs(flight.currents).max():.2f} A, largest travel"
+        f" {1e3 * np.abs(flight.pose[:, :3]).max():.1f} mm and "
+        f"{np.rad2deg(np.linalg.norm(flight.pose[:, 3:], axis=1).max()):.1f} deg"
+        f"; condition number of the scaled equations {first.condition:.1f}. Columns: true and identified value of "
+        f"the first trial, half-width of its 95 % interval, and the worst error of {len(results)} trials with the "
+        "rounded pose and with the diodes (lower is better).",
         "",
         "| | true | identified | 95 % interval | worst error | worst error, diodes |",
         "| --- |" + " ---: |" * 5,
@@ -180,8 +189,9 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
     lines += [
         "",
         f"{100 * inside[0]:.0f} % of the intervals contain the true value, {100 * inside[1]:.0f} "
-        "% with the diodes. They are wider than the errors from noise, because they include the "
-        "error of differences over 5 ms at 6 Hz.",
+        "% with the diodes. The intervals are wider than the errors from noise, because they include the error "
+        "of differences over 5 ms at 6 Hz. The next table shows why identification matters: hovering and steps "
+        "with a control that assumes the wrong, the identified and the true flotor (lower is better).",
         "",
         "| control assumes | height at rest, error [um] | worst deviation of a step [%] |"
         " worst cross motion [%] |", "| --- | ---: | ---: | ---: |",
@@ -215,11 +225,12 @@ def detent() -> list[str]:
     flotor.model.jnt_stiffness[:3], flotor.model.dof_damping[:3] = 2e4, 100.0
     lines = [
         "## Detent", "",
-        "x axis of the feller-buncher (Zhu 1994, Table 6.11 and Fig. 6.51). A clamp of 20 N/mm "
-        "moves the handle outwards and waits. The law: stiffness "
-        f"{1e-3 * gains.nominal_stiffness:g} N/mm inside the dead band, a force drop at its edge, "
-        f"{1e-3 * gains.detent.slope:g} N/mm outside. The table compares the force of the clamp "
-        "with it at that displacement.",
+        "A detent is a drop of the centring force at the edge of the dead band, which the operator can feel. "
+        "This test checks that the simulated joystick produces the designed force, for the x axis of the "
+        "feller-buncher (Table 6.11 and Fig. 6.51). A simulated clamp of 20 N/mm moves the handle outwards in "
+        "steps and waits. Column \"force\": force of the clamp. Column \"law\": designed force, with a stiffness "
+        f"of {1e-3 * gains.nominal_stiffness:g} N/mm inside the dead band, a force drop at its edge, and "
+        f"{1e-3 * gains.detent.slope:g} N/mm outside.",
         "",
         "| displacement [mm] | force [N] | law [N] |", "| ---: | ---: | ---: |",
     ]  # fmt: skip
@@ -234,7 +245,7 @@ def detent() -> list[str]:
         now, felt = float(flotor.data.qpos[0]), float(np.mean(forces[-40:]))
         worst = max(worst, abs(felt + law.force(now)))
         lines.append(f"| {1e3 * now:.3f} | {felt:.3f} | {-law.force(now):.3f} |")
-    return [*lines, "", f"Largest difference {1e3 * worst:.1f} mN.", ""]
+    return [*lines, "", f"The largest difference is {1e3 * worst:.1f} mN.", ""]
 
 
 def coils_moved(qpos: np.ndarray) -> np.ndarray:
@@ -253,7 +264,9 @@ def travel() -> list[str]:
         "## Travel and stops", "",
         "Zhu 1994, 5.1.2: \"The joystick workspace is limited by the size of the magnetic gap "
         "[...] approximately + 5 mm translational motion and + 7 deg rotational motion from the "
-        "nominal center\". The stops are therefore at the coils. Their centre moves by "
+        "nominal center\". "
+        "The stops of the simulated joystick are therefore at the coils. The centre of the coils moves by"
+        " "
         f"{1e3 * limits.translation:g} mm along each axis, and the flotor rotates by "
         f"{np.rad2deg(limits.rotation):g} deg. The centre of the handle is "
         f"{1e3 * JOYSTICK.flotor.handle[2]:g} mm above the coils (A). A rotation about the handle "
@@ -261,9 +274,9 @@ def travel() -> list[str]:
         f"x and y and by {deg[2]:.2f} deg about z. The feller-buncher's printed dead band of "
         f"0.035 rad (Table 6.9) could not be left with a handle higher than {1e3 * bound:.0f} mm.",
         "",
-        "At rest under 20 N at the height of the coils (2 N m about an axis); no hand, weight "
-        "carried. Last row: 20 N at the handle, which tilt the flotor about its stop. Lower is "
-        "better.",
+        "The table shows how far the stops give way under 20 N at the height of the coils, or 2 N m about an "
+        "axis (lower is better). No hand holds the handle, and its weight is carried. In the last row the 20 N "
+        "act at the handle and tilt the flotor about its stop.",
         "",
         "| axis | beyond the stop |", "| --- | ---: |",
     ]  # fmt: skip
@@ -309,10 +322,12 @@ def damping() -> list[str]:
     printed = {"excavator": (600.0, 6.0, 6.0, 3.0), "feller": (4000.0, 45.0, 25.0, 4.0)}
     lines = [
         "## Rotational damping", "",
-        "Tables 6.7 and 6.9 print 0.03 and 0.04 in 100 N m/rad/s, that is 3 and 4 N m s/rad. The "
-        "control rate is 200 Hz (5.3). The table gives the largest eigenvalue of the sampled "
-        "loop: below 1 the handle comes to rest. x and ry are coupled with the springs of x (60 "
-        "N s/m) at the handle, free and held. rz is uncoupled, without a hand.",
+        "The printed rotational damping cannot be used, as this section shows. Tables 6.7 and 6.9 print 0.03 and "
+        "0.04 in units of 100 N m/rad/s, that is 3 and 4 N m s/rad. The control rate is 200 Hz (5.3). The last "
+        "three columns give the largest eigenvalue of the sampled control loop. Below 1 the handle comes to "
+        "rest; above 1 its motion grows in every period. \"free\" and \"held\": the coupled motion of x and ry "
+        "with the spring of x at the handle (damping 60 N s/m), without and with a hand. \"rz\": rotation about "
+        "z, which is uncoupled, without a hand.",
         "",
         "| gains | damping [N m s/rad] | rate [Hz] | free | held | rz |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
@@ -340,17 +355,22 @@ def damping() -> list[str]:
     fast = [min_stable_handle_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
     return [
         *lines, "",
-        "Half: the damper acts on the rate of the Euler vector of 5.1.3, which is half of the "
-        "rate of the angle. Unit 1: the unit of damping is 1 and not 100 N m/rad/s. Chosen: the "
-        "value of this library, an assumption.",
+        "The second column tests three readings of the printed value, and the chosen one. Half: the damper acts "
+        "on the rate of the Euler vector of 5.1.3, which is half of the rate of the angle. Unit 1: the unit of "
+        "damping is 1 and not 100 N m/rad/s. Chosen: the value of this project (A), stable at 200 Hz in rz and "
+        "with a hand.",
         "",
-        f"At 200 Hz the printed damping of rz requires {1e3 * needed[0]:.1f} and "
-        f"{1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher). These are radii of gyration of "
+        f"To be stable at 200 Hz, the printed damping of rz requires moments of inertia of {1e3 * needed[0]:.1f} "
+        f"and {1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher). These are radii of gyration of"
+        " "
         f"{radii[0]:.0f} and {radii[1]:.0f} mm for {f.mass:g} kg, with the coils at "
-        f"{1e3 * JOYSTICK.coils.radius:g} mm. The library's flotor has {1e3 * f.inertia[0]:g} and "
-        f"{1e3 * f.inertia[2]:g} g m^2. At 1 kHz, {1e3 * fast[0]:.1f} and {1e3 * fast[1]:.1f} g "
+        f"{1e3 * JOYSTICK.coils.radius:g} mm. "
+        f"The simulated flotor has {1e3 * f.inertia[0]:g} g m^2 about x and y, and {1e3 * f.inertia[2]:g} g m^2 "
+        "about z."
+        f" At 1 kHz, {1e3 * fast[0]:.1f} and {1e3 * fast[1]:.1f} g "
         "m^2 would be enough. The largest damping at which rz of this flotor is stable at 200 Hz "
-        f"with 6 N m/rad is {max_stable_handle_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
+        "with a stiffness of 6 N m/rad is"
+        f" {max_stable_handle_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
         "",
     ]  # fmt: skip
 
@@ -362,12 +382,12 @@ def heat() -> list[str]:
     handle, weight = JOYSTICK.flotor.handle[2], 9.81 * JOYSTICK.flotor.mass
     lines = [
         "## Heat", "",
-        "Zhu 1994, 6.3: \"a stiff joystick could easily cause heating problem\". Detents are "
-        f"intended to avoid it. The coils carry {c.continuous_current:g} A continuously and have "
-        f"a thermal time constant of {c.thermal_time:g} s (both A). A hand holds one axis with "
-        "the gains of the feller-buncher at nine tenths of its reach. Heat: final temperature "
-        "rise over the allowed one (lower is better). Time: until cold coils reach the allowed "
-        "temperature.",
+        "Zhu 1994, 6.3: \"a stiff joystick could easily cause heating problem\". "
+        f"Detents are intended to avoid it, and they do here. The coils carry {c.continuous_current:g} A "
+        f"continuously and have a thermal time constant of {c.thermal_time:g} s (both A). A hand holds one axis "
+        "at nine tenths of its reach, with the gains of the feller-buncher: first against the linear centring "
+        "spring, then with the detent. Heat: final temperature rise divided by the allowed one; above 1 the "
+        "coils become too hot (lower is better). Time: until cold coils reach the allowed temperature.",
         "",
         "| axis | linear spring: force [N], [N m] | current [A] | heat | time [s] |"
         " detent: force [N], [N m] | current [A] | heat | time [s] |", "| --- |" + " ---: |" * 8,
@@ -400,8 +420,11 @@ def force_over_the_gap() -> list[str]:
     lines = [
         "## Force over the gap", "",
         "Zhu 1994, 5.1.2: \"Due to the small motion range\" M is \"approximately\" constant; the "
-        "loss of a coil is not stated. The table assumes a fraction lost quadratically towards "
-        "the end of the gap, which the control does not know. Errors: smaller is better.",
+        "loss of a coil is not stated. "
+        "The table shows the consequences of an unknown loss. It assumes that a coil"
+        " loses force quadratically "
+        "towards the end of the gap and that the control does not know this. First column: fraction lost at 5 "
+        "mm. Errors: smaller is better.",
         "",
         "| lost at 5 mm [%] | error of 4.8 N at the handle at x = 4.5 mm [N] | drop of the"
         " hovering flotor there [um] | error of 4.8 N at x = 2 mm [N] |",
@@ -456,10 +479,11 @@ def shaking() -> list[str]:
     }
     lines = [
         "## Motion of the cab", "",
-        f"Swing of `excitation` on the CAT 215, up to {np.abs(spin).max():.2f} rad/s and "
-        f"{np.abs(change).max():.2f} rad/s^2, joystick at {JOYSTICK.mount} m in the cab. With a "
-        "hand, the springs are those of the table `excavator`. Tremor is omitted. Lower is "
-        "better.",
+        "The cab swings with the machine and shakes the joystick in it. The table shows how far the handle moves "
+        "without being commanded (lower is better). The motion is the swing of the scenario `excitation` on the "
+        f"CAT 215, up to {np.abs(spin).max():.2f} rad/s and {np.abs(change).max():.2f} rad/s^2. The joystick is "
+        f"at {JOYSTICK.mount} m in the cab. With a hand, the centring springs are the gains `excavator` (Table "
+        "6.7). Tremor of the hand is omitted.",
         "",
         "| | largest displacement [mm] | RMS [mm] | largest rotation [deg] |",
         "| --- | ---: | ---: | ---: |",
@@ -504,23 +528,28 @@ def draw(path: Path) -> None:
 def report(results) -> str:
     """The whole result in Markdown."""
     intro = [
-        "The magnetically levitated joystick is simulated without the machine. The study "
-        "compares its steps, identification, detent, stops and heating with the design and with "
-        "Zhu 1994. The accuracy of the device limits that of teleoperation. (A) marks an "
-        "assumption of this project.",
+        "This page tests the simulated joystick alone, without a machine: how accurately it follows commands, "
+        "identifies its own moving part, renders forces, and where its limits are. The joystick is the "
+        "magnetically levitated one of Zhu 1994. Its moving part, the flotor, carries the handle and floats "
+        "between six coils. The simulation behaves as designed: steps deviate from the designed response by less "
+        "than 5 %, and the force at a detent by 2 mN. One printed value could not be used: the rotational "
+        "damping of Zhu 1994 is unstable on this flotor at 200 Hz (see below). Section, table and figure numbers "
+        "are those of Zhu 1994. (A) marks an assumption of this project. Axes: x, y, z are translations of the "
+        "handle, rx, ry, rz rotations about them.",
         "",
     ]
     limits = [
         "## Limits", "",
         "- Identification includes no error of the coil map and none of the position of the "
         "diodes; a real joystick has both.",
-        "- No inertia of this size makes the printed rotational damping stable at 200 Hz. About "
-        "z, the height of the handle has no influence. Either the printed unit of damping is not "
-        "that of stiffness, or the coil loop ran faster than the 200 Hz of 5.3.",
-        "- Without a hand, x and ry are unstable with every one of these springs at 200 Hz: a "
-        "push at the handle tilts a free flotor. A handle without a hand is therefore held by "
-        "the law of 5.1.3, which controls the six axes as uncoupled second-order systems by the pose "
-        "of the flotor.",
+        "- "
+        "No flotor of this size makes the printed rotational damping stable at 200 Hz. Either the printed unit "
+        "of damping is not that of stiffness, or the coil loop of the real joystick ran faster than the 200 Hz "
+        "of 5.3.",
+        "- "
+        "Without a hand, x and ry are unstable at 200 Hz with all of these dampings, because a push at the "
+        "handle tilts a free flotor. A handle without a hand is therefore held by the law of 5.1.3. It controls "
+        "the six axes of the flotor as uncoupled second-order systems.",
         "- Zhu 1994 does not state how the coil force decreases over the gap.",
         "",
     ]  # fmt: skip

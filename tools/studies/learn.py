@@ -250,7 +250,8 @@ def main() -> None:
     lines = [
         tabulate_scores(scores, figures),
         "",
-        "Learned controller minus tuned reference, paired by episode:\n",
+        "Difference in the same episodes, learned controller minus tuned reference, also in standard errors (above 3"
+        " the difference is certain):\n",
     ]
     lines += [f"- {difference(scores, figure)}" for figure in figures]
     text = "\n".join(lines)
@@ -268,25 +269,27 @@ def head(asked: argparse.Namespace) -> str:
         does = f"corrects the tuned reference by at most {recipe.share:g} of a full action"
     options = ", ".join(f"{key} {value}" for key, value in recipe.options.items())
     machines = (
-        "Machines have the effects of `typical_variation`; training and test machines differ."
+        "Machines have random effects (`typical_variation`: valves, friction, oil, delay, payload); training and test"
+        " machines differ."
         if recipe.randomised
         else "The machine is nominal."
     )
     gains = ", ".join(f"{key} {value:g}" for key, value in recipe.gains.items())
     return (
         f"# Learned and tuned controllers: {asked.task}\n\n"
-        "A learned controller is compared with a tuned reference controller on episodes that"
-        " neither of them used before.\n\n"
+        "Does reinforcement learning give a better controller than a hand-written one? A learned controller is compared"
+        " with a tuned reference controller on episodes that neither of them used before. The table and the two lines"
+        " below it show the result.\n\n"
         f"`{command} --seed {facts['seed']}`\n\n"
         f"- The network, trained with PPO in {facts['steps']:,} steps, {does}. Its input is the"
         f" last {recipe.history} steps.\n"
         f"- Both controllers have {options}. {machines}\n"
-        f"- The reference was tuned on the training machines (`--tune`): {gains}."
-        " Units of the gains: 1/s (`position`, `swing`, `pressure`), s (`lead`, `load_time`), 1/s^2 (`integral`). They"
-        " are those of the joint servo ([source](../../hydrotele/scenario/scenario.py), `Servo`); `swing` replaces"
-        " `position` for the swing, `integral` is an added integral term.\n"
-        f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return and a"
-        " smaller error are better."
+        f"- The reference was tuned on the training machines (`--tune`): {gains}. These are gains of the "
+        "joint servo ([source](../../hydrotele/scenario/scenario.py), `Servo`) in 1/s (`position`, "
+        "`swing`, `pressure`), s (`lead`, `load_time`) and 1/s^2 (`integral`). `swing` replaces "
+        "`position` for the swing, `integral` is an added integral term.\n"
+        f"- Cells are mean ± standard error of {asked.episodes} episodes. A larger return (sum of rewards) and a"
+        " smaller tip error are better. `zero` takes no action."
     )
 
 

@@ -196,7 +196,7 @@ def crossover_part(asked, pool) -> str:
     rows = []
     for form, name in enumerate(FORMS):
         found = list(pool.map(crossover, range(asked.operators), [form] * asked.operators,
-                              [asked.memory_records] * asked.operators))  # fmt: skip
+                              [asked.records] * asked.operators))  # fmt: skip
         w, m = [c.frequency for c in found], [math.degrees(c.margin) for c in found]
         s = [c.slope for c in found]
         limits = CROSSOVER[name], MARGIN[name], SLOPE
@@ -283,7 +283,7 @@ def sensitivity_part(asked, pool) -> str:
     cases += [("grip", name) for name in FILE.grips] + [("posture", name) for name in FILE.postures]
     n = len(cases)
     found = list(pool.map(sensitivity, [c[0] for c in cases], [c[1] for c in cases],
-                          [asked.seeds] * n, [asked.memory_records] * n, [asked.trials] * n))  # fmt: skip
+                          [asked.seeds] * n, [asked.records] * n, [asked.trials] * n))  # fmt: skip
     rows = [("nominal", "", *(f"{x:.3g}" for x in found[0]))]
     for (name, value), one in zip(cases[1:], found[1:], strict=True):
         basis = FILE.parameters[name].basis if name in FILE.parameters else "assumption"

@@ -39,10 +39,13 @@ CUTS = (
 )
 
 INTRODUCTION = (
-    "This study computes the condition number, the ambiguity of the forward kinematics and the"
-    " speed of the regressor. A condition number of 1 is best; rotations are multiplied by the radius of"
-    f" the platform's joints, {1e3 * RADIUS:g} mm. [The map](palida_workspace.png)"
-    " shows the singularities and the workspace."
+    "How well conditioned is the geometry of the hexapod PaLiDA (a platform on six telescopic legs), and can "
+    "its pose be computed from leg lengths? This study gives the condition number of its Jacobian, the "
+    "number of poses with equal leg lengths, and the computing time of its regressor.\n\n"
+    "The inverse Jacobian relates platform to leg velocities. A large condition number means a singularity, "
+    "where legs cannot hold the platform; rotations are multiplied by the radius of the platform's joints, "
+    f"{1e3 * RADIUS:g} mm. In [the map](palida_workspace.png) light is good and dark is singular; the white "
+    "line is the workspace that leg strokes and hinges allow."
 )
 
 
@@ -145,9 +148,14 @@ def main() -> None:
     home = np.linalg.cond(joint_jacobian(chain, q, chain.drives, own.setup.given_joints) / scale)
     found = find_assemblies(chain, chain.drives, legs, body="platform", starts=2000)
     rows.append(f"| condition number of the inverse Jacobian at the home pose | {home:.1f} |")
-    rows.append(f"| poses with the leg lengths of the home pose, from 2000 starts | {len(found)} |")
+    rows.append(
+        f"| poses that have the same leg lengths as the home pose, found from 2000 random starts | {len(found)} |"
+    )
     count, seconds = speed()
-    rows.append(f"| time of the regressor, {count} rows, 24 joints, 19 bodies | {seconds:.2f} s on one core |")
+    rows.append(
+        f"| time of the regressor (matrix that relates parameters to drive forces), {count} rows, 24 joints,"
+        f" 19 bodies | {seconds:.2f} s on one core |"
+    )
     publish("\n".join(rows) + "\n", "Kinematics of the hexapod PaLiDA", asked)
 
 

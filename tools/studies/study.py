@@ -43,7 +43,7 @@ def side_by_side(trial: Callable, asked: argparse.Namespace, *more: Any) -> list
 
 
 def publish(text: str, title: str, asked: argparse.Namespace) -> None:
-    """Print a result; write it with its command where a file was asked for."""
+    """Print a result; write it where a file was asked for, with its command after the first paragraph."""
     print(text)
     if not asked.out:
         return
@@ -54,4 +54,7 @@ def publish(text: str, title: str, asked: argparse.Namespace) -> None:
             words += [] if name in _ASIDE else [f"../shared/{value.name}"]
         elif name not in _ASIDE and value not in (None, ""):
             words += [f"--{name}", f"{value}"]
-    asked.out.write_text(f"# {title}\n\n`{' '.join(words)}`\n\n{text}", encoding="utf-8")
+    command = f"Command: `{' '.join(words)}`"
+    first, _, rest = text.partition("\n\n")
+    page = [command, text] if first.startswith(("#", "|", "-", "!")) else [first, command, rest]
+    asked.out.write_text("\n\n".join([f"# {title}", *page]), encoding="utf-8")

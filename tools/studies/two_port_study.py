@@ -87,23 +87,33 @@ def main() -> None:
     shipped = shipped_table(2 * asked.points + 1)
     drawn = random_table(side_by_side(trial, asked, asked.points))
     text = "\n".join([
-        "The two-port formula predicts the impedance that the operator feels and whether the "
-        "loop is stable. Both are compared with simulations of two masses.",
+        "The [two-port](../how_it_works/teleoperation.md#analysis-as-a-two-port) is a linear model of a "
+        "teleoperation system: handle and slave machine, each a mass, connected by a controller with delay. "
+        "Its formula predicts the impedance (force per velocity) that the operator feels, and whether the "
+        "loop is stable. This study checks both against simulations of the two masses. Required are an "
+        "impedance error of at most 3 %, and the right stability in 95 % of the cases.",
         "",
-        "Impedance error: largest error of the formula against a simulation with imposed sines "
-        "of 0.1 to 5 Hz; required: at most 3 % (lower is better). Cells: points of a map over "
-        "delay (0 to 500 ms each way) and the factor on the returned signal (0.01 to 100). They "
-        "agree if the argument principle and a simulated kick of the hand give the same "
-        "stability; required: 95 % (higher is better). `hydrotele analyse teleop --confirm` "
-        "computes the first table for any case.",
+        "Each row is one control structure. In `position_position` (coordinating force) positions are sent "
+        "both ways. In `position_force` (direct force) a position is sent to the slave and a force back. "
+        "Four-channel structures send motion and force both ways. `rate_` structures and `four_channel_rate` "
+        "are the same under rate control. Columns:",
+        "",
+        "- impedance error: largest error of the formula against a simulation in which the handle is moved "
+        "by sines of 0.1 to 5 Hz; smaller is better;",
+        "- cells that agree: stability is compared in the cells of a map over delay (0 to 500 ms each way) "
+        "and the factor on the returned signal (0.01 to 100). A cell agrees if the formula (argument "
+        "principle) and a simulated push of the hand give the same answer, stable or unstable.",
+        "",
+        "`hydrotele analyse teleop --confirm` computes the first table for your case.",
         "", "## The shipped case", "", *shipped, "",
         f"## {asked.trials} random cases", "",
-        "Every mass, damper, spring and gain of the shipped case times 10^u, with u uniform "
-        f"between {-SPREAD} and {SPREAD}. Sweeps without delay, and with one of up to "
-        f"{1e3 * SWEPT:g} ms.",
+        "Every mass, damper, spring and gain of the shipped case is multiplied by 10^u, with u uniform "
+        f"between {-SPREAD} and {SPREAD}. `agree`: cells in which formula and simulation agree; worst case: "
+        "the lowest value of a single random case. Sweeps: simulations that measure the impedance, without "
+        f"delay and with one of up to {1e3 * SWEPT:g} ms; the last three columns give their errors.",
         "", *drawn, "", "## Limits", "",
-        "- Not measurable: the slave is unstable while the handle is held, so that nothing "
-        "settles.",
+        "- A sweep is not measurable if the slave is unstable while the handle is held, because the motion then "
+        "never settles.",
         "",
     ])  # fmt: skip
     publish(text, "The two-port against simulation", asked)

@@ -1,4 +1,4 @@
-"""Judge every criterion of a document by runs with a deliberate fault.
+"""Test every criterion of a published experiment by runs with a planted (deliberate) fault.
 
     python tools/validation/break_experiments.py NAME [--only "ROW,ROW"] [--jobs 2] [--out FILE]
 
@@ -9,10 +9,14 @@ fail in the way that it should: exit status 1.
 import argparse
 import sys
 
-from hydrotele.experiments.comparison import run_with_faults
+from hydrotele.experiments.comparison import Series, run_with_faults
 from tools.studies.experiment_seeds import import_series, report_progress
 
 _PAGES = {"abdellatif2008": "parallel_robot"}  # page of the comparison, if its name differs
+_DOCUMENTS = {
+    "abdellatif2008": "Abdellatif 2008", "khoshzaban1992": "Khoshzaban 1992", "wang2012": "Wang 2012",
+    "zhu1994": "Zhu 1994",
+}  # fmt: skip
 
 
 def main() -> None:
@@ -30,32 +34,13 @@ def main() -> None:
         parser.error(f"no row {unknown.pop()!r}; valid: {', '.join(series.claims)}")
     judged = run_with_faults(series, names, arguments.jobs, report_progress)
 
-    lines = [
-        f"# Broken runs of {arguments.name}", "",
-        f"`python tools/validation/break_experiments.py {arguments.name}`", "",
-        f"Rows of the [comparison]({_PAGES.get(arguments.name, arguments.name)}.md) are repeated with a planted"
-        " fault, up to six times. A criterion works if the verdict is *differs*. For a row that differs",
-        "without the fault as well, the run only shows that the fault does not make it agree. Names and fixed texts in"
-        " the third column are those of the row",
-        "without the fault; where they contradict the fault, the fault applies.", "",
-        "`inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
-        " not exist in a repetition, or cannot be",
-        "defined because the repetitions have no scatter. A very large number: the scatter or the denominator is"
-        " almost zero with the fault, or an estimate",
-        "diverges in single repetitions.", "",
-        "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
-    ]  # fmt: skip
-    for claim, row in judged:
-        cells = (claim.name, claim.fault_description, row.simulated, row.verdict)
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     failed = [claim.name for claim, row in judged if row.verdict != "differs"]
-    lines += ["", f"{len(judged) - len(failed)} of {len(judged)} rows say differs.", ""]
-    unbroken = [name for name, claim in series.claims.items() if claim.fault is None]
-    if unbroken and not names:
-        lines += [f"No fault was planted for these rows: {', '.join(unbroken)}.", ""]
-    unavailable = [row.name for row in series.unavailable]
-    if unavailable and not names:
-        lines += [f"These rows cannot be computed and have no criterion: {', '.join(unavailable)}.", ""]
+    lines = format_introduction(arguments.name, len(judged), len(failed))
+    for claim, row in judged:
+        cells = (claim.name, claim.fault_description, row.format_simulated_cell(),
+                 row.format_criterion_cell(only_ranges=True), row.verdict)  # fmt: skip
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    lines += ["", *([] if names else list_rows_without_fault(series))]
     text = "\n".join(lines)
     print(text)
     if arguments.out:
@@ -63,6 +48,58 @@ def main() -> None:
             file.write(text)
     if failed:
         sys.exit(f"no difference found: {', '.join(failed)}")
+
+
+def format_introduction(name: str, count: int, failures: int) -> list[str]:
+    """Return the lines of the page before its first row: title, result, and how to read the table.
+
+    Args:
+        name: name of the publication, such as `zhu1994`.
+        count: number of rows with a fault.
+        failures: number of these rows whose verdict is not `differs`.
+    """
+    document = _DOCUMENTS.get(name, name)
+    return [
+        f"# Planted faults: {document}", "",
+        f"This page shows that the criteria of the [comparison with {document}]({_PAGES.get(name, name)}.md) can fail."
+        " A criterion is a range of simulated values that agree with",
+        "a published result. A criterion that every simulation meets proves nothing. Therefore each experiment is"
+        " repeated with a planted fault: one deliberate error in",
+        "the simulation, such as a wrong length. The verdict of the row must then be *differs*.", "",
+        f"Result: {count - failures} of {count} rows say *differs*{'' if failures else ', as required'}. Command:"
+        f" `python tools/validation/break_experiments.py {name}`.", "",
+        "How to read the table:", "",
+        "- Row: name of the row in the comparison, which states the published result and explains the symbols.",
+        "- Fault: what is changed in the simulation, for this row only.",
+        "- Simulated with the fault: the quantities that the criterion needs. Brackets `[a, b]` are 95 % intervals over"
+        " up to six repetitions with different random numbers;",
+        "  parentheses `(a to b)` are the smallest and largest value of the repetitions. Text after \"In addition\""
+        " does not affect the verdict.",
+        "- Range that agrees: accepted values of each quantity; the comparison gives the reasons. \"Outside\" lists the"
+        " quantities whose intervals are completely outside their",
+        "  range; \"partly outside\" those whose intervals are partly inside.",
+        "- Verdict: *differs* if at least one quantity is outside, or is not a finite number (`inf`, `nan`).",
+        "- A row may differ in the comparison, too. Its fault then shows only that the fault does not make it agree.",
+        "- Names of quantities are those without the fault. If a name contradicts the fault, the fault applies.",
+        "- `inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
+        " not exist in a repetition, or has no definition, because",
+        "  the repetitions have no scatter. Very large numbers occur if the fault makes a scatter or a denominator"
+        " almost zero, or if an estimate diverges.", "",
+        "| row | fault | simulated with the fault | range that agrees | verdict |", "| --- | --- | --- | --- | --- |",
+    ]  # fmt: skip
+
+
+def list_rows_without_fault(series: Series) -> list[str]:
+    """Return lines that list the rows of a publication that have no planted fault, by reason."""
+    claims = series.claims
+    groups = {
+        "No fault was planted for these rows, which check inputs of the model":
+            [name for name, claim in claims.items() if claim.fault is None and claim.kind != "caption"],
+        "These rows have no criterion, because only a caption of the result is available":
+            [name for name, claim in claims.items() if claim.kind == "caption"],
+        "These rows have no criterion, because they cannot be computed": [row.name for row in series.unavailable],
+    }  # fmt: skip
+    return [line for words, names in groups.items() if names for line in (f"{words}: {'; '.join(names)}.", "")]
 
 
 if __name__ == "__main__":

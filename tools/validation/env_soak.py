@@ -28,11 +28,13 @@ def main() -> None:
     each = -(-asked.steps // (len(cases) * asked.batch))
     rows = [_soak(*case, each, asked) for case in cases]
     lines = [
-        "Long sequences of random actions test that no environment produces a value that is not"
-        " finite, an observation outside its space, a MuJoCo warning or an unstable simulation."
-        " Required: 0 in these columns.\n\nActions are uniform and are held for a random number of"
-        " steps. Observations are tested after every step. Readings beyond the limits of the space"
-        " are counted before they are saturated.\n",
+        "Can random actions break a control task? Long sequences of random steps test that no environment "
+        "produces a value that is not finite, an observation outside its stated space, a MuJoCo warning or "
+        "an unstable simulation. These four columns must be 0.\n",
+        "Each row is one task with one kind of actions and sensors. Actions are uniformly random, each held "
+        "for a random number of steps; observations are tested after every step. Saturated readings, which "
+        "are allowed, count sensor values beyond the limits of the space that were cut off at the limit. "
+        "The last column is the speed of the test.\n",
         "| task | actions | sensors | steps | episodes | not finite | outside the space | MuJoCo's"
         " warnings | unstable | saturated readings | physics steps/s |",
         "| " + " | ".join(["---"] * 11) + " |",

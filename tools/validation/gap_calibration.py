@@ -85,9 +85,15 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     for test, limit in LIMITS.items():
         rows[f"worst channel, {test}"] = ([n["tests"][test] for n in noted.values()], limit)
     lines = [
-        f"{len(noted)} simulated unchanged machines; motions and sensors of the"
-        " [blind validation](blind_trials/summary.md). Score: gain of twice the log evidence, less the complexity",
-        "penalty. The other figures are the [residual tests](../gap.md#residual-tests).",
+        f"Gap finding must not name an effect if nothing is hidden. {len(noted)} simulated unchanged machines are"
+        " searched; motions and sensors are those of the [blind validation](blind_trials/summary.md).",
+        "",
+        "- score of the best effect: how much the best effect improves twice the log [evidence](../terms.md), less a"
+        f" penalty for its parameters. An effect is added to the model only above {ENTER:g}.",
+        "- worst channel: the largest value over all channels of each [residual test](../gap.md#residual-tests) of the"
+        " prediction errors. A test fails only above its threshold.",
+        "",
+        "Columns: the value that this fraction of the machines does not exceed. All must be below the threshold.",
         "",
         "| figure | " + " | ".join(f"{s:.0%} quantile" for s in _SHARES) + " | threshold |",
         "| --- |" + " --- |" * (len(_SHARES) + 1),
@@ -100,12 +106,13 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
     over = [n["effect"] for n in noted.values() if n["score"] >= ENTER and n["worth_naming"]]
     document["falsely named"] = over
     count = f"{len(over)} {over or ''}".rstrip()
-    lines += ["", f"Effects above the threshold and large enough to name: {count}."]
+    lines += ["", f"Number of machines on which an effect is above the threshold and large enough to name: {count}."]
     pulled = [n["pulls"] for n in noted.values() if n["pulls"]]
     if pulled:
-        lines += ["", "Estimate divided by its stated standard deviation,"
-                  f" {len(pulled)} machines (ideal: 1; 0: these logs do not determine the effect,"
-                  " and the estimate stays at its nominal value):",
+        lines += ["", f"Second table: each effect is estimated on {len(pulled)} unchanged machines, so its true value"
+                  " is the nominal one. The RMS of the estimate's error divided by its stated standard deviation should"
+                  " be 1. Below 1 the stated uncertainty is too large, above 1 too small. 0 means that these logs do"
+                  " not determine the effect, and the estimate stays at its nominal value.",
                   "", "| effect | RMS |", "| --- | --- |"]  # fmt: skip
         document["pulls"] = {}
         for key in pulled[0]:
@@ -116,7 +123,11 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
         beyond = float(np.mean(np.abs(every) > 1.96))
         size = float(np.sqrt(np.mean(np.square(every))))
         document |= {"pulls_rms": size, "beyond_1.96": beyond}
-        lines += ["", f"All effects: RMS {size:.2f}; fraction beyond 1.96: {beyond:.1%}."]
+        lines += [
+            "",
+            f"All effects together: RMS {size:.2f}. A fraction of {beyond:.1%} of the errors exceeds 1.96"
+            " standard deviations (ideal: 5 %).",
+        ]
     return document, "\n".join(lines) + "\n"
 
 

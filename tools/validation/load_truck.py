@@ -32,27 +32,39 @@ FULL_RATE = 0.95  # share of the rate limit above which an axis counts as limite
 STRUCK, HEAPED = 0.59, 0.91  # m^3 that the bucket holds, see hydrotele.soil.parameters.CAT215
 SIZE = (760, 480)  # pixel
 INTRODUCTION = """\
-The reference controller of `hydrotele/LoadTruck-v0` fills a truck with the CAT 215: 5 m3 of loose soil, bank 0.5 to 1 m
-high, swing of 70 to 110 deg, walls of the truck 1.9 m high ([task](../environments.md#loadtruck)). Actions are
-joint rates, sensors are ideal, and every episode has its own soil, bank and start.
+How well does the hand-written reference controller load a truck, and how realistic are the cycles? In the
+environment `hydrotele/LoadTruck-v0`, a CAT 215 fills a truck with 5 m3 of loose soil.
+
+The bank is 0.5 to 1 m high, the swing 70 to 110 deg, the walls of the truck 1.9 m high
+([task](../environments.md#loadtruck)). Actions are joint rates, sensors are ideal, and every episode has its own
+soil, bank and start.
 
 ![Trench and load](../load_truck.png)
 
+The trench and the load in the truck after five bucket loads.
+
+Each row is a kind of soil. Loads: bucket loads in all episodes. Fill: volume of a load relative to the heaped
+bucket (0.91 m3). A larger return (sum of rewards) is better.
+
 """
 CONCLUSION = """
+## What limits the cycle
+
 For a truck on the floor of the excavation next to the soil, the Caterpillar Performance Handbook
 ([edition 47, page 7-246](https://cld.bz/bookdata/S232Z0r/basic-html/page-575.html)) calls cycles of 10 to 17 s
-practical; 15 to 20 s are typical. The cycles here are at the slow end of this range. The tables show what limits them:
+practical; 15 to 20 s are typical. The cycles here are at the slow end of this range, because of:
 
 - Swing: both swings cover 2 x 1.6 rad at 0.6 rad/s, the rate of the joint servo (0.8 of the valve's rated flow).
 - Pump: 300 L/min feed all four axes, so lifting and swinging slow each other down.
 - Bucket: the joint servo opens it with 0.48 rad/s, the rate that is possible over the whole range.
 
-In firm soil this holds for about six loads only. Then the boom cannot press the edge into the bottom of the trench,
-and the controller repeats the same cut with little soil. Most trucks are not full after 240 s there.
+## Limits
 
-Limits of the task: the load moves without inertia, falls at once and does not push on the bucket. Next to the strip,
-the ground resists sideways motion only. Soil is conserved as loose volume, see the balance.
+- In firm soil the controller works for about six loads only. Then the boom cannot press the cutting edge into the
+  bottom of the trench,
+  and the controller repeats the same cut with little soil. Most trucks are not full after 240 s there.
+- The load in the bucket has no inertia, falls at once and does not push on the bucket.
+- Outside the strip that is dug, the ground resists sideways motion only.
 """
 
 
@@ -117,8 +129,8 @@ def describe_fills(core: TaskCore, found: dict[str, np.ndarray]) -> str:
         f"\nOf the {done.sum()} filled trucks: {core.episodes['step'][done].mean() / 50.0:.0f} s and"
         f" {m[done, LOADS].mean():.1f} loads per truck, {cycle.mean():.1f} s per cycle ({cycle.min():.1f} to"
         f" {cycle.max():.1f} s). Loads of the bucket: {found['loads'].min():.2f} to {found['loads'].max():.2f} m3"
-        f" (struck {STRUCK}, heaped {HEAPED} m3).\n\nBalance of volumes, removed = loaded + carried + spilled: largest"
-        f" error {error:.1e} m3.\n"
+        f" (struck {STRUCK}, heaped {HEAPED} m3).\n\nNo soil is lost: removed = loaded + carried + spilled within"
+        f" {error:.1e} m3.\n"
     )
     return "\n".join(rows)
 
@@ -127,6 +139,8 @@ def describe_phases(core: TaskCore, found: dict[str, np.ndarray]) -> str:
     """Return the table of the time that each phase takes, and of what limits it."""
     loads, axes = core.measures[:, LOADS].sum(), core.setup.axes
     rows = [
+        "The next table shows where the time of a cycle goes and what limits the speed: the fraction of the time in"
+        " which the pump flow, or the rate limit of an axis' servo, is reached.\n",
         f"| phase | s per cycle | pump flow limits [%] | {' | '.join(f'{axis} at its rate [%]' for axis in axes)} |",
         "| --- |" + " ---: |" * (2 + len(axes)),
     ]
@@ -142,7 +156,12 @@ def describe_phases(core: TaskCore, found: dict[str, np.ndarray]) -> str:
 
 def describe_single_phases(seed: int) -> str:
     """Return the table of the single phases: success and return of reference controller, zero and random actions."""
-    rows = ["| phase | reference: success | return | zero: return | random: return |", "| --- |" + " ---: |" * 4]
+    rows = [
+        "Each phase of the cycle is also a separate environment. Mean return ± standard error of the reference"
+        " controller, of no action (zero) and of random actions; success is a fraction of episodes.\n",
+        "| phase | reference: success | return | zero: return | random: return |",
+        "| --- |" + " ---: |" * 4,
+    ]
     for phase in PHASES[1:]:
         core = TaskCore(TASK, Options(variants=32, phase=phase), 32, 0, DISABLED)
         scores = [
@@ -161,6 +180,8 @@ def describe_single_phases(seed: int) -> str:
 def describe_speed(steps: int) -> str:
     """Return the table of the speed with the actions of the reference controller, in processor time."""
     rows = [
+        'Speed of the environment by number of environments and threads. A step is 20 ms. "With controller" includes'
+        " the reference controller.\n",
         "| environments | threads | processor time per step [us] | with controller [us] | steps/s per core | times real"
         " time per core | elapsed time: steps/s |",
         "| ---: |" + " ---: |" * 6,

@@ -187,7 +187,7 @@ def main() -> int:
                 f" {result['speed']:.1f} | {_said(pressures)} |",
                 flush=True,
             )
-    print(f"\nTotal: {total} steps, {bad} NaN states, warnings and impossible pressures.")
+    print(f"\nTotal: {total} steps, {bad} states with NaN, warnings or impossible pressures.")
     return 1 if bad else 0
 
 

@@ -70,9 +70,11 @@ def measure_differences(task: str, count: int) -> list[float]:
 def main() -> None:
     asked = options(__doc__, count=1024, episodes=32, seconds=3.0)
     text = [
-        f'Environments on the reduced model (`device="cpu"`) and those on MuJoCo compared. Speed: {asked.count}'
-        " environments with real sensors at 50 Hz, random actions, environment steps per second of processor time"
-        " and core.\n",
+        "Can a controller be trained faster without MuJoCo? Environments can run on the [reduced "
+        "model](../how_it_works/closed_chains.md#two-models-of-one-machine) (`device='cpu'`), which solves "
+        "the linkages exactly. They are compared with the same environments on MuJoCo.\n",
+        f"Speed: {asked.count} environments with real sensors at 50 Hz and random actions. Cells: environment "
+        "steps per second of processor time and core; larger is better.\n",
         "| task | actions | MuJoCo | reduced model | ratio |",
         "| --- | --- | --- | --- | --- |",
     ]
@@ -80,9 +82,11 @@ def main() -> None:
         exact, reduced = (measure_speed(task, asked.count, device, asked.seconds) for device in (None, "cpu"))
         text.append(f"| {task} | {chosen['action']} | {exact:,.0f} | {reduced:,.0f} | {reduced / exact:.1f} |")
     text += [
-        f"\nDifferences over {asked.episodes} whole episodes on randomised machines (`typical_variation`) with ideal"
-        " sensors: both get the actions that the reference controller computes from the observations on MuJoCo. The"
-        " actions do not correct the motion of the second machine, except for `resolved_motion`, whose servo does.\n",
+        f"\nAccuracy: {asked.episodes} whole episodes on randomised machines (`typical_variation`) with ideal "
+        "sensors. Both simulations get the same actions, which the reference controller computes from the "
+        "observations on MuJoCo. Nothing corrects the motion of the second simulation, except in tasks with "
+        "`resolved_motion`, whose servo does. Cells: differences between the two simulations (smaller is "
+        "better) and the mean return of each.\n",
         "| task | tip, largest [mm] | tip, RMS [mm] | pressures, RMS [bar] | mean return on MuJoCo | reduced model |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
@@ -90,8 +94,9 @@ def main() -> None:
         most, tip, pressure, exact, reduced = measure_differences(task, asked.episodes)
         text.append(f"| {task} | {most:.2f} | {tip:.2f} | {pressure:.2f} | {exact:.2f} | {reduced:.2f} |")
     text += [
-        "\nGoals, variants and first observations are equal bit by bit. The models share all laws; their integrators"
-        " differ, and MuJoCo's closures are soft constraints."
+        "\nGoals, machine variants and first observations are equal bit by bit. Both simulations have the "
+        "same physical laws. They differ in the time integrator, and MuJoCo holds closed linkages by soft "
+        "constraints.",
     ]
     publish("\n".join(text) + "\n", "Environments on the reduced model", asked)
 

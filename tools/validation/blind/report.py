@@ -25,10 +25,10 @@ _CRITERIA = {
 }
 
 _WEAK = (
-    "Visibility: root of the summed squares of the changes by the effect, in standard deviations of"
-    " the noise, over all samples and channels of the fitted runs. An effect is weak if its"
-    f" visibility is below {DETECTABLE:g}. To miss a weak effect is no error; to name another"
-    " effect instead is an error. Single effects by visibility, including weak ones:"
+    "[Visibility](../../terms.md) measures how strongly an effect changes the readings, in standard deviations of the"
+    f" noise. An effect is weak if its visibility is below {DETECTABLE:g}. To miss a weak effect is no error in the"
+    " rows without weak ones; to name another effect instead is an error. Single effects by visibility,"
+    " including weak ones:"
 )
 
 
@@ -62,6 +62,8 @@ def markdown(series: Any, scores: dict[str, Any], control: dict[str, Any], verdi
         f" {series.duration:g} s. Correct means the right name and location; an ambiguous answer"
         " that contains the truth counts as correct.",
         "",
+        "Values are fractions of the trials. Reached compares the value with the requirement of the project.",
+        "",
         "| criterion | value | required | reached |",
         "| --- | ---: | --- | --- |",
     ]
@@ -70,6 +72,9 @@ def markdown(series: Any, scores: dict[str, Any], control: dict[str, Any], verdi
         word = {None: "no data", True: "yes", False: "no"}[target["reached"]]
         lines.append(f"| {_CRITERIA.get(name, name)} | {value} | {target['asked']} | {word} |")
     lines += [
+        "",
+        "Each row is a class: one effect of the library (single), two (double), none (clean), or an effect that the"
+        " library does not contain (outside). Correct: fraction, number of trials, and its 95 % interval in per cent.",
         "",
         "| class | correct | without weak effects | verdicts |",
         "| --- | --- | --- | --- |",
@@ -81,7 +86,12 @@ def markdown(series: Any, scores: dict[str, Any], control: dict[str, Any], verdi
     lines += ["", _WEAK, "", "| visibility | correct |", "| --- | --- |"]
     lines += [f"| {bin_} | {_share(part)} |" for bin_, part in scores["by_visibility"].items()]
     crossed = ", ".join(f"{kind} {_share(part)}" for kind, part in control.items())
-    lines += ["", f"Control, keys exchanged between trials (must be close to 0): {crossed}.", ""]
+    lines += [
+        "",
+        "As a control of the scoring, every answer is compared with the hidden effect of another trial."
+        f" The fraction of correct answers must then be close to 0: {crossed}.",
+        "",
+    ]
     for file, title in _PICTURES:
         lines.append(f"![{title}]({file})")
     lines += ["", "## Incorrect answers", "",
