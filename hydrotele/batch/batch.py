@@ -5,13 +5,13 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba.extending import intrinsic
 
 from hydrotele.batch import machine_step
-from hydrotele.batch.machine_step import Machines, Noise, Timing, make_lanes, store_linkage
+from hydrotele.batch.machine_step import NO_TASK, Machines, Noise, Task, Timing, make_lanes, store_linkage
 from hydrotele.batch.mechanism_code import PROGRAMS, MechanismCode, trace_mechanism
 from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.device import rebuild_function
@@ -41,30 +41,6 @@ _MECHANISM_PARAMETERS = ("shape", "joint", "gravity")
 
 
 LANES = 8  # machines per block on the CPU: two vectors of four numbers
-
-
-class Task(NamedTuple):
-    """Functions that run in the step of each machine, in the same compiled code, and their arrays.
-
-    Attributes:
-        before: compiled function with the arguments of `machine_step.before_period`.
-        after: compiled function with the arguments of `machine_step.after_period`.
-        arrays: NamedTuple of arrays, the first argument of both; their first dimension is 1 or the number of
-            machines.
-    """
-
-    before: Any
-    after: Any
-    arrays: Any
-
-
-class NoTask(NamedTuple):
-    """Arrays of a batch without a task."""
-
-    unused: np.ndarray
-
-
-NO_TASK = Task(machine_step.before_period, machine_step.after_period, NoTask(np.zeros(1)))
 
 
 class Batch:

@@ -28,7 +28,7 @@ class DeviceCore(ReducedCore):
         """Make the machines and the kernels; the arguments are those of `ReducedCore`."""
         super().__init__(task, options, count, threads, autoreset, device="cuda")
         if self.batch.count != count:
-            raise InputError("num_envs", f"must be at least the number of variants on a CUDA device, {self.batch.count}")
+            raise InputError("num_envs", f"must be at least {self.batch.count}, the number of variants")
 
     def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
         """Start new episodes in all simulations or in the chosen ones; see `TaskCore.reset`."""

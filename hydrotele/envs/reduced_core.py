@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.batch.batch import PARAMETERS, Batch
-from hydrotele.batch.batch import Task as BatchTask
+from hydrotele.batch.machine_step import Task as BatchTask
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import STEP
 from hydrotele.envs.episode_batch import MAX_THREADS, TaskCore, check_count, make_task_setup
@@ -87,7 +87,10 @@ class ReducedCore(TaskCore):
         rows = max(int(count), len(machines))  # the code of the mechanism is made for all variants
         self._allocate_arrays(rows, autoreset)
         self.episodes["over"][count:] = 1
-        self._functions, channels = make_step_functions(self.setup.task.kind), sensor_channels(self.setup.variants.plant)
+        self._functions, channels = (
+            make_step_functions(self.setup.task.kind),
+            sensor_channels(self.setup.variants.plant),
+        )
         models = [reduced_model(machine, channels) for machine in machines]
         starts, *measured = make_start_states(self.setup, machines, models)
         arrays = self._make_episode_arrays(machines, models, *measured)

@@ -99,9 +99,7 @@ class Policy(GaussianMixin, Model):
 
     def __init__(self, env: TensorEnv) -> None:
         """Make the network for the spaces of an environment."""
-        Model.__init__(
-            self, observation_space=env.observation_space, action_space=env.action_space, device=env.device
-        )
+        Model.__init__(self, observation_space=env.observation_space, action_space=env.action_space, device=env.device)
         GaussianMixin.__init__(self, clip_actions=False, clip_log_std=True, min_log_std=-3.0, max_log_std=0.5)
         self.net, self.first = make_network(env, self.num_actions)
         torch.nn.init.orthogonal_(self.net[-1].weight, 0.01)
@@ -117,9 +115,7 @@ class Value(DeterministicMixin, Model):
 
     def __init__(self, env: TensorEnv) -> None:
         """Make the network for the observations of an environment."""
-        Model.__init__(
-            self, observation_space=env.observation_space, action_space=env.action_space, device=env.device
-        )
+        Model.__init__(self, observation_space=env.observation_space, action_space=env.action_space, device=env.device)
         DeterministicMixin.__init__(self, clip_actions=False)
         self.net, self.first = make_network(env, 1)
 

@@ -55,7 +55,7 @@ def count_failures(tool: str, machines: int) -> int:
 
 
 def measure_environments(device: str, count: int, seconds: float) -> dict[str, float]:
-    """Return environment steps per second of TrackTrajectory at 50 Hz with noise, and the time to its first step [s]."""
+    """Return environment steps per second of TrackTrajectory at 50 Hz with noise, and time to the first step [s]."""
     begin = time.perf_counter()
     env: Any = gymnasium.make_vec(
         "hydrotele/TrackTrajectory-v0", count, device=device, sensors="real", autoreset_mode="SameStep"

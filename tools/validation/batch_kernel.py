@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numba import from_dtype, typeof, types
 
-from hydrotele.batch.batch import NO_TASK, Batch
-from hydrotele.batch.cuda_kernel import make_cuda_kernel, make_element_kernel
+from hydrotele.batch.batch import Batch
+from hydrotele.batch.cuda_kernel import make_cuda_kernels, make_element_kernel
+from hydrotele.batch.machine_step import NO_TASK
 from hydrotele.core.device import import_cuda
 from hydrotele.envs.episode import NEXT_STEP
 from hydrotele.envs.task_catalogue import make_task_core
@@ -64,12 +65,17 @@ def compile_to_ptx(kernel: Any, *arguments: Any) -> tuple[str, float]:
     return ptx, round(time.process_time() - begin, 1)
 
 
-def compile_step(batch: Batch, task: Any) -> dict[str, Any]:
-    """Compile the kernel that advances a batch."""
-    kernel, parameters = make_cuda_kernel(batch._single, batch.model, task, batch.machine.terms)
-    records = (batch.model, batch.machines, batch._noise, batch._timing, task.arrays)
-    ptx, elapsed = compile_to_ptx(kernel, *records, 1, parameters)
-    return {"ptx_s": elapsed} | link_machine_code(ptx)
+def compile_kernels(batch: Batch) -> dict[str, dict[str, Any]]:
+    """Compile the kernels that advance a batch; return their figures by name."""
+    kernels = make_cuda_kernels(batch._single, batch.model, batch.task, batch.machine.terms)
+    found = {}
+    for name in ("step", "before", "after"):
+        if (kernel := getattr(kernels, name)) is not None:
+            arrays = NO_TASK.arrays if name == "step" else batch.task_arrays
+            given = (batch.model, batch.machines, batch._noise, batch._timing, arrays, kernels.source)
+            ptx, elapsed = compile_to_ptx(kernel, *given, *((1,) if name == "step" else ()))
+            found[name] = {"ptx_s": elapsed} | link_machine_code(ptx)
+    return found
 
 
 def compile_begin(core: Any) -> dict[str, Any]:
@@ -90,10 +96,10 @@ def main() -> None:
     setattr(dispatcher, "get_current_device", lambda: SimpleNamespace(compute_capability=CAPABILITY))  # noqa: B010
     if chosen.task:
         core: Any = make_task_core(chosen.task, {"device": "cpu"}, 8, 1, NEXT_STEP)
-        kernels = {"begin of episodes": compile_begin(core), "step": compile_step(core.batch, core.batch.task)}
+        kernels = {"begin of episodes": compile_begin(core), **compile_kernels(core.batch)}
     else:
         batch = Batch(load_machine("cat215", chosen.tool), 8, threads=1)
-        kernels = {"step": compile_step(batch, NO_TASK)}
+        kernels = compile_kernels(batch)
     for title, figures in kernels.items():
         print(title)
         for name, value in figures.items():
