@@ -58,10 +58,8 @@ _STABILITY_LEGEND = (
     " motion; released: the same without a hand\n"
     "gain margin: factor on the reflected signal (force, or motion of the slave) up to which the"
     " loop is stable; higher is better, and below 1 the loop is unstable\n"
-    "max delay: one-way delay up to which the loop is stable; higher is better; >: largest delay"
-    " that was tested\n"
-    "norm: maximum norm of the scattering matrix over frequency; the two-port is passive if it does"
-    " not exceed 1"
+    "max delay: one-way delay up to which the loop is stable; higher is better; >: largest delay that was tested\n"
+    "norm: maximum norm of the scattering matrix over frequency; the two-port is passive if it does not exceed 1"
 )
 _ROBUST_LEGEND = (
     "pairs held: random pairs of operator and task with which the loop is stable; pairs released:"

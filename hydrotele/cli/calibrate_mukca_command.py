@@ -313,8 +313,7 @@ def _print(
         for outlier in one.calibrated_errors.outliers:
             stdout_console.print(
                 f"[yellow]outlier[/] {outlier.socket}, row {outlier.line}:"
-                f" {1e3 * outlier.distance:.2f} mm from its socket in the held-out prediction,"
-                " included in the RMS"
+                f" {1e3 * outlier.distance:.2f} mm from its socket in the held-out prediction, included in the RMS"
             )
     for note in document["notes"]:
         stdout_console.print(f"[yellow]note[/] {note}")

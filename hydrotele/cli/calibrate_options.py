@@ -13,27 +13,31 @@ app = CommandGroup(
     no_args_is_help=True,
 )  # fmt: skip
 
-DataOption = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
-HeldOutOption = Annotated[str | None, typer.Option(help="Held-out part of the data; the default is described below.")]
-OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: nothing is written.")]
-MachineOption = Annotated[
-    str, typer.Option("--machine", "-m", help="Machine with a calibrator: shipped name or folder.")
+DataOption = Annotated[Path, typer.Option("--data", "-d", help="Folder with the measurements.")]
+HeldOutOption = Annotated[
+    str | None,
+    typer.Option(help="Part of the data that tests the result and is not fitted; see the description of the command."),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder. Default: nothing is written.")]
+MachineOption = Annotated[
+    str, typer.Option("--machine", "-m", help="Machine with a calibrator: name of a shipped machine, or its folder.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 
 
 @app.command(epilog="Example:  hydrotele calibrate arm --data logs --json --out calibrated")
 def arm(
     data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
     machine: MachineOption = "calibrator",
-    method: Annotated[str, typer.Option(help="Identification: joint or hierarchical.")] = "joint",
-    poses: Annotated[int, typer.Option(min=10, help="Number of poses used of each log.")] = 300,
+    method: Annotated[str, typer.Option(help="Identify all links together (joint) or one after another"
+    " (hierarchical).")] = "joint",
+    poses: Annotated[int, typer.Option(min=10, help="Number of poses that are used from each log.")] = 300,
     accuracy_deg: Annotated[
-        float | None, typer.Option(help="Standard deviation of an angle sensor [deg].")
+        float | None, typer.Option(help="Standard deviation of the angle sensors [deg]. Default: that of the logs.")
     ] = None,
     bad_data: Annotated[bool, typer.Option(help="Detect and exclude corrupted samples.")] = True,
     drift: Annotated[
-        bool, typer.Option(help="Correct the drift of held links by the arm's own sensors.")
+        bool, typer.Option(help="Correct slow motion of the links that should not move, by the arm's own sensors.")
     ] = True,
     flexibility: Annotated[
         bool, typer.Option(help="Estimate the bending of the calibrator's joints under load.")
@@ -41,8 +45,8 @@ def arm(
 ) -> None:  # fmt: skip
     """Calibrate the links of an arm from logs of an external calibrator (Khoshzaban 1992).
 
-    Give one log for each link; in each log, only that link moves. With --heldout N, every N-th
-    pose is used for validation and not fitted; default: 5.
+    The folder --data contains one log for each link; in each log, only that link moves. With
+    --heldout N, every N-th pose tests the result and is not fitted. Default: 5.
     """
     from hydrotele.cli.calibrate_arm_command import ArmChoices, calibrate_arm
 
@@ -55,12 +59,13 @@ def linkage(
     data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
     machine: MachineOption = "calibrator",
     angles: Annotated[
-        str, typer.Option(help="Joint angles: measured (by sensors) or identified (calibrator).")
+        str, typer.Option(help="Source of the joint angles: measured (the arm's sensors) or identified"
+        " (from the calibrator).")
     ] = "measured",
 ) -> None:  # fmt: skip
     """Calibrate the cylinder linkages of an arm from joint angles and cylinder lengths.
 
-    Every fifth sample is used for validation and not fitted.
+    Every fifth sample tests the result and is not fitted.
     """
     from hydrotele.cli.calibrate_linkage_command import calibrate_linkage
 
@@ -75,9 +80,14 @@ def machine(
     out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")],
     dynamics: Annotated[
         list[Path] | None,
-        typer.Option(help="Logs for the dynamic step. Repeatable. Default: --data."),
+        typer.Option(
+            help="Logs from which masses and friction are identified. Default: those of --data. Can be"
+            " given several times."
+        ),
     ] = None,
-    heldout: Annotated[str | None, typer.Option(help="Held-out run of the dynamic logs.")] = None,
+    heldout: Annotated[
+        str | None, typer.Option(help="Run of the logs of --dynamics that tests the result and is not fitted.")
+    ] = None,
     json: JsonOption = False,
     machine: MachineOption = "calibrator",
 ) -> None:
@@ -97,19 +107,38 @@ def machine(
     " --out calibrated   |   hydrotele gap --data calibrated/logs --machine calibrated/machine.yaml"
 )
 def imu(
-    data: Annotated[list[Path], typer.Option("--data", "-d", help="Log with IMU channels, or folder. Repeatable.")],
-    machine: Annotated[str, typer.Option("--machine", "-m", help="Machine with IMUs: shipped name or folder.")],
-    tool: Annotated[str | None, typer.Option("--tool", "-t", help="Tool; default: that of the machine.")] = None,
+    data: Annotated[
+        list[Path],
+        typer.Option("--data", "-d", help="Log with IMU channels, or folder of logs. Can be given several times."),
+    ],
+    machine: Annotated[
+        str, typer.Option("--machine", "-m", help="Machine with IMUs: name of a shipped machine, or its folder.")
+    ],
+    tool: Annotated[
+        str | None, typer.Option("--tool", "-t", help="Name of the mounted tool, for machines with several tools.")
+    ] = None,
     sensors: Annotated[
-        str | None, typer.Option("--sensors", "-s", help="Sensor set with the IMUs; default: that of the logs.")
+        str | None,
+        typer.Option(
+            "--sensors", "-s", help="Sensor set of the machine file that contains the IMUs. Default: that of the logs."
+        ),
     ] = None,
     pose: Annotated[
         list[str] | None,
-        typer.Option(help="Known joint positions at a time: '[RUN@]SECONDS AXIS=VALUE[deg] ...'. Repeatable."),
+        typer.Option(
+            help="Known joint positions at a time: '[RUN@]SECONDS AXIS=VALUE[deg] ...'. Can be given several times."
+        ),
     ] = None,
-    pose_sd_deg: Annotated[float, typer.Option(min=1e-4, help="Standard deviation of --pose [deg].")] = 0.1,
+    pose_sd_deg: Annotated[
+        float, typer.Option(min=1e-4, help="Standard deviation of the positions of --pose [deg].")
+    ] = 0.1,
     slope_sd_deg: Annotated[
-        float, typer.Option(min=0.0, max=45.0, help="Standard deviation of the ground's slope [deg]; 0: level.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=45.0,
+            help="Standard deviation of the slope of the ground [deg]; 0 means that the ground is level.",
+        ),
     ] = 0.0,
     out: OutOption = None,
     json: JsonOption = False,
@@ -129,7 +158,7 @@ def imu(
 @app.command(epilog="Example:  hydrotele calibrate design --out design")
 def design(
     out: OutOption = None, json: JsonOption = False, machine: MachineOption = "calibrator",
-    accuracy_deg: Annotated[float, typer.Option(help="Error bound of angle sensors [deg].")] = 0.1,
+    accuracy_deg: Annotated[float, typer.Option(help="Largest error of the angle sensors [deg].")] = 0.1,
 ) -> None:  # fmt: skip
     """Design a calibrator: arm lengths and ball-joint position for the smallest tip error."""
     from hydrotele.cli.calibrate_arm_command import design_calibrator
@@ -143,24 +172,57 @@ def design(
     "hydrotele calibrate hybrid --data measured --evolution --posterior 8000 --json"
 )
 def hybrid(
-    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder with poses.csv or poses.parquet.")] = None,
-    robot: Annotated[str | None, typer.Option(help="Nominal robot; default: robot.yaml in the folder, or iwr.")] = None,
-    model: Annotated[str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")] = "auto",
-    parameters: Annotated[str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")] = "all",
-    evolution: Annotated[bool, typer.Option("--evolution", help="Also search by differential evolution.")] = False,
+    data: Annotated[
+        Path | None, typer.Option("--data", "-d", help="Folder with the measured poses, poses.csv or poses.parquet.")
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="File of the nominal robot. Default: robot.yaml in the folder, else the shipped robot iwr."),
+    ] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="Error model of the serial part: dh (Denavit-Hartenberg), poe (product of exponentials),"
+            " or auto (the better one)."
+        ),
+    ] = "auto",
+    parameters: Annotated[
+        str,
+        typer.Option(help="Parameters to estimate: all, document (the 36 of Wang 2012), or names separated by commas."),
+    ] = "all",
+    evolution: Annotated[
+        bool, typer.Option("--evolution", help="Also search globally, by differential evolution.")
+    ] = False,
     posterior: Annotated[
-        int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC, 40 steps or more.")
+        int,
+        typer.Option(
+            min=0,
+            metavar="STEPS",
+            help="Also sample the posterior by MCMC with this number of steps, 40 or more; 0 means no.",
+        ),
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
-    simulate: Annotated[Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")] = None,
-    poses: Annotated[int, typer.Option(min=1, help="Number of simulated poses.")] = 25,
-    heldout: Annotated[int, typer.Option(min=0, help="Number of simulated held-out poses.")] = 25,
+    simulate: Annotated[
+        Path | None, typer.Option(help="Simulate a measurement and write it to this folder, instead of a calibration.")
+    ] = None,
+    poses: Annotated[int, typer.Option(min=1, help="With --simulate: number of poses.")] = 25,
+    heldout: Annotated[
+        int,
+        typer.Option(
+            min=0, help="With --simulate: number of additional poses that test the result and are not fitted."
+        ),
+    ] = 25,
     choose: Annotated[
         str,
-        typer.Option(help="Simulated poses: random, or the best of 200 by criterion D, O1 to O5."),
+        typer.Option(
+            help="With --simulate: random poses, or the most informative of 200 by the criterion D, O1, O2,"
+            " O3, O4 or O5."
+        ),
     ] = "random",
-    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated sensor noise.")] = 1.0,
-    errors: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated errors of 1 mm and 1 mrad.")] = 1.0,
+    noise: Annotated[float, typer.Option(min=0.0, help="With --simulate: factor on the sensor noise.")] = 1.0,
+    errors: Annotated[
+        float, typer.Option(min=0.0, help="With --simulate: factor on the geometric errors of 1 mm and 1 mrad.")
+    ] = 1.0,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -180,19 +242,26 @@ def hybrid(
     "hydrotele calibrate scara --data measured --out calibrated"
 )
 def scara(
-    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder of nominal.yaml and measured.csv.")] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", "-d", help="Folder with nominal.yaml and measured.csv.")
+    ] = None,
     heldout: Annotated[
         str | None,
-        typer.Option(help="Held-out poses, numbered from 1, as 3,7; default: each in turn."),
+        typer.Option(
+            help="Numbers of the poses that test the result, such as 3,7; the first pose is 1. Default:"
+            " each pose in turn."
+        ),
     ] = None,
-    simulate: Annotated[Path | None, typer.Option(help="Write simulated measurements to this folder.")] = None,
-    poses: Annotated[int, typer.Option(min=4, help="Number of simulated poses.")] = 20,
+    simulate: Annotated[Path | None, typer.Option(help="Simulate measurements and write them to this folder.")] = None,
+    poses: Annotated[int, typer.Option(min=4, help="With --simulate: number of poses.")] = 20,
     noise: Annotated[
         float,
-        typer.Option(min=0.0, help="Standard deviation of simulated positions [mm]."),
+        typer.Option(min=0.0, help="With --simulate: standard deviation of the measured positions [mm]."),
     ] = 0.05,
-    seed: Annotated[int, typer.Option(help="Random seed of the simulation, 0 or more.")] = 1,
-    choose: Annotated[int | None, typer.Option(min=2, help="Also list this many most informative poses.")] = None,
+    seed: Annotated[int, typer.Option(help="With --simulate: seed of the random numbers, 0 or more.")] = 1,
+    choose: Annotated[
+        int | None, typer.Option(min=2, help="Also list the most informative poses; the value is their number.")
+    ] = None,
     out: OutOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -213,27 +282,38 @@ def scara(
     "hydrotele calibrate mukca --data sets --robot arm.urdf --heldout left --json"
 )
 def mukca(
-    data: Annotated[Path, typer.Option("--data", "-d", help="Folder of PLACE/hole_0.csv, PLACE/hole_1.csv.")],
+    data: Annotated[
+        Path,
+        typer.Option(
+            "--data",
+            "-d",
+            help="Folder with one folder for each place of the tool, which contains hole_0.csv, hole_1.csv,"
+            " ... (one for each socket).",
+        ),
+    ],
     robot: Annotated[
         str | None,
         typer.Option(
-            help="Shipped robot, or a YAML, URDF or MJCF file; default: the file in the data"
+            help="Name of a shipped robot, or a YAML, URDF or MJCF file. Default: the file in the data"
             " folder, else the shipped robot that fits best."
         ),
     ] = None,
     heldout: Annotated[
         str | None,
-        typer.Option(help="Held-out place; default: every place in turn."),
+        typer.Option(help="Name of the place that tests the result and is not fitted. Default: every place in turn."),
     ] = None,
     distance: Annotated[
         float,
-        typer.Option(min=0.0, help="Distance of neighbouring sockets [mm]; 0 if not known."),
+        typer.Option(min=0.0, help="Distance of neighbouring sockets [mm]; 0 means unknown."),
     ] = 50.0,
     accuracy: Annotated[float, typer.Option(min=1e-6, help="Standard deviation of that distance [mm].")] = 0.05,
     unit: Annotated[str, typer.Option(help="Unit of the joint angles: rad or deg.")] = "rad",
     model: Annotated[
         str | None,
-        typer.Option(help="Joint model: rigid, gravity, eccentricity or both; default: the most accurate prediction."),
+        typer.Option(
+            help="Model of the joints: rigid, gravity (elastic under weight), eccentricity (of the"
+            " encoders) or both. Default: the one with the most accurate prediction."
+        ),
     ] = None,
     out: OutOption = None,
     json: JsonOption = False,

@@ -19,20 +19,20 @@ listen on addresses other than 127.0.0.1 only in a private network.
 
 def haptic_device(
     kind: Annotated[
-        str, typer.Option("--kind", help="simulated, force-dimension, haption, haption:HOST#PORT.")
+        str, typer.Option("--kind", help="Kind of device: simulated, force-dimension, haption or haption:HOST#PORT.")
     ] = "simulated",
-    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0: any free port.")] = 5610,
-    rate: Annotated[float, typer.Option("--rate", min=50, max=4000, help="Sampling rate [Hz].")] = 1000,
+    host: Annotated[str, typer.Option("--host", help="Network address on which the server listens.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0 means any free port.")] = 5610,
+    rate: Annotated[float, typer.Option("--rate", min=50, max=4000, help="Rate of the force loop [Hz].")] = 1000,
     duration: Annotated[
-        float | None, typer.Option("--duration", min=1e-3, help="Duration [s]; default: until Ctrl-C.")
+        float | None, typer.Option("--duration", min=1e-3, help="Duration [s]. Default: until Ctrl-C.")
     ] = None,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Stop when standard input is closed.", hidden=True)
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
-    """Serve a haptic device over UDP: send poses, apply wrenches, watchdog."""
+    """Connect a haptic device to `hydrotele drive` over UDP: send its pose, apply forces."""
     from hydrotele.cli.haptic_device_command import HapticOptions, serve_device
 
     serve_device(HapticOptions(kind, host, port, rate, duration, until_eof, json))

@@ -24,20 +24,21 @@ _KIND = "operator identification"
 
 def identify_operator(
     file: Annotated[Path, typer.Argument(help="Log of a tracking task, .csv or .parquet.")],
-    time: Annotated[str | None, typer.Option(help="Time column; default: time.")] = None,
-    target: Annotated[str | None, typer.Option(help="Target column.")] = None,
-    response: Annotated[str | None, typer.Option(help="Response column.")] = None,
-    hand: Annotated[str | None, typer.Option(help="Column of the hand position.")] = None,
+    time: Annotated[str | None, typer.Option(help="Name of the time column. Default: time.")] = None,
+    target: Annotated[str | None, typer.Option(help="Name of the column of the target. Default: target.")] = None,
+    response: Annotated[str | None, typer.Option(help="Name of the column of the response. Default: response.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Name of the column of the hand position. Default: hand.")] = None,
     equalisation: Annotated[
-        str | None, typer.Option(help="gain, lead, lag or integral; default: the best fit.")
+        str | None,
+        typer.Option(help="Form of the operator model: gain, lead, lag or integral. Default: the form that fits best."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder for operator.yaml and fit.json."),
+        typer.Option("--out", "-o", help="Folder in which operator.yaml and fit.json are written."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
-    """Fit the operator model to a tracking log: delay, margins, lag, remnant."""
+    """Fit the operator model to a log of a tracking task: delay, margins, lag, remnant."""
     import hydrotele
     from hydrotele.cli.console import print_json, stderr_console, to_json_types, write_json
     from hydrotele.core.output import atomic_folder, check_output_folder

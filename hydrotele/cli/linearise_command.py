@@ -17,31 +17,38 @@ Examples:  hydrotele linearise cat215
            hydrotele linearise cat325 --speed 0.05 --out model.json
 
 \b
-The table lists the oscillations of mechanism and oil; those of the valves are in the file. With
-speed 0 an axis holds its load with a closed valve, and its model has no dry friction and no dead
-band. From Python: hydrotele.linearise(machine, pose, speed); docs/linear_models.md.
+The table lists the oscillations of mechanism and oil; the file of --out also contains those of the
+valves. With speed 0 an axis holds its load with a closed valve; its model has no dry friction and no
+dead band. From Python: hydrotele.linearise(machine, pose, speed); docs/linear_models.md.
 """
 
 
 def linearise(
-    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
-    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
+    machine: Annotated[str, typer.Argument(help="Name of a shipped machine, or folder with machine.yaml.")],
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Name of the mounted tool, for machines with several tools.")
+    ] = None,
     pose: Annotated[
         list[str] | None,
         typer.Option(
             "--pose",
             metavar="JOINT=VALUE,...",
-            help="Joint positions [rad] or [m]; others are at home. Repeatable.",
+            help="Joint positions of a pose [rad] or [m]; other joints are at their home positions. Can be"
+            " given several times.",
         ),
     ] = None,
     speed: Annotated[
         str,
-        typer.Option(metavar="VALUE or AXIS=VALUE,...", help="Rate of all hydraulic axes or of some [rad/s] or [m/s]."),
+        typer.Option(
+            metavar="VALUE or AXIS=VALUE,...", help="Velocity of all hydraulic axes, or of some [rad/s] or [m/s]."
+        ),
     ] = "0",
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="PNG file for natural frequencies, damping and gain.")
+        Path | None, typer.Option("--plot", help="Plot natural frequencies, damping and gain in this PNG file.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="JSON file for the matrices of all poses.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write the matrices of all poses to this JSON file.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the models as JSON, and nothing else.")] = False,
 ) -> None:
     """Compute linear state-space models of a machine at poses; list natural frequencies and damping."""

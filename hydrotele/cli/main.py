@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import typer
 
 from hydrotele.cli.calibrate_options import app as calibrate_app
+from hydrotele.cli.epilogs import COMPARE_EPILOG, DRIVE_EPILOG, IMPORT_EPILOG, SWEEP_EPILOG
 from hydrotele.cli.haptic_device_options import HAPTIC_EPILOG, haptic_device
 from hydrotele.cli.identify_operator_command import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.linearise_command import LINEARISE_EPILOG, linearise
@@ -51,38 +52,18 @@ EffectFilesOption = Annotated[
         "--effects",
         metavar="FILE.py",
         callback=_load_effect_files,
-        help="Python file that defines custom effects or laws. It is executed. Repeatable.",
+        help="Python file that defines custom effects or laws. The file is run as Python code, so use only"
+        " files that you trust. Can be given several times.",
     ),
 ]
-
-
-COMPARE_EPILOG = """\b
-Examples:  hydrotele compare cat215 gap_site_a --data measured/site_a
-           hydrotele compare ec20 --data long.parquet --baseline table --baseline mlp --out compared
-           hydrotele compare cat215 --data logs --heldout run_7 --horizons 2,20 --json
-
-\b
-Each model predicts a held-out run, which was not used to fit it. The prediction starts at many rows
-of the log, from the state estimated there. It then uses only the commands (open-loop prediction)
-and is compared with the measurements. The one-step error, from one row to the next, is listed as
-well. Horizons longer than the run are omitted.
-
-\b
-A result folder of gap with posterior.parquet also gets a 95 % prediction band, from machines sampled
-from the posterior. The band holds parameter uncertainty and measurement noise, not missing laws.
-
-\b
-Black-box models, fitted on the other runs (--baseline, repeatable):
-  table   delay and static table from command to speed, for each axis
-  arx     linear model with past measurements and commands as inputs
-  mlp     neural network with the same inputs; needs pip install 'hydrotele[baselines]'
-"""
 
 
 ContactChoice = Annotated[
     Literal["mask", "ignore"],
     typer.Option(
-        "--contact", help="Mask intervals in which pressures show contact or a load of the tool, or use them."
+        "--contact",
+        help="Intervals in which cylinder pressures show contact or a load of the tool: mask (do not use)"
+        " or ignore (use as other intervals).",
     ),
 ]
 
@@ -90,21 +71,40 @@ ContactChoice = Annotated[
 def compare(
     machine: Annotated[
         list[str],
-        typer.Argument(help="Shipped machines, folders with machine.yaml, result folders of gap or identify."),
+        typer.Argument(
+            help="Models to compare: shipped machines, folders with machine.yaml, result folders of gap or identify."
+        ),
     ],
-    data: Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")],
-    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machines.")] = None,
-    heldout: Annotated[
-        str | None, typer.Option(help="Held-out run; default: test*, else the last; of one run its last quarter.")
+    data: Annotated[
+        list[Path],
+        typer.Option("--data", "-d", help="Log file, folder of logs, or run folder (output of `hydrotele run`)."),
+    ],
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Name of the mounted tool, for machines with several tools.")
     ] = None,
-    sensors: Annotated[str | None, typer.Option(help="Sensor set of the machines.")] = None,
+    heldout: Annotated[
+        str | None,
+        typer.Option(
+            help="Run that tests the result and is not fitted. Default: a run whose name begins with test, heldout or"
+            " validation, else the last run; with a single run, its last quarter."
+        ),
+    ] = None,
+    sensors: Annotated[
+        str | None,
+        typer.Option(
+            help="Sensor set of the machine files, which states rate and accuracy. Default: that of the logs."
+        ),
+    ] = None,
     horizons: Annotated[
-        str, typer.Option(help="Prediction horizons [s]; the end of the run is always included.")
+        str, typer.Option(help="Times over which the models predict [s]. The whole run is always added.")
     ] = "1,5,10,30",
     baseline: Annotated[
-        list[str] | None, typer.Option("--baseline", help="Black-box model: table, arx or mlp.")
+        list[str] | None,
+        typer.Option("--baseline", help="Also fit and compare a black-box model: table, arx or mlp (explained below)."),
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Evaluate the models on the fitted runs as well.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="Test the models on the fitted runs, too, not only on the held-out run.")
+    ] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a plot.")] = None,
     bands: Annotated[
         int | None,
@@ -112,13 +112,16 @@ def compare(
             "--bands",
             min=0,
             max=MAX_BANDS,
-            help="Machines sampled per result folder of gap, for prediction bands; default: 20 with a posterior.",
+            help="Number of machines that are sampled from the posterior of each result folder of gap, for"
+            " prediction bands. Default: 20 if the folder has a posterior.",
         ),
     ] = None,
     effects: EffectFilesOption = None,
     contact: ContactChoice = "mask",
-    force: Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Accept logs whose metadata name another machine or tool.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
     """Compare open-loop predictions of several models with logs: RMS error per channel."""
     from hydrotele.cli.compare_command import compare_models
@@ -129,60 +132,50 @@ def compare(
     )  # fmt: skip
 
 
-DRIVE_EPILOG = """\b
-Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
-           hydrotele drive --device scripted:moves.csv --no-viewer --speed 0
-           hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
-           hydrotele drive --web --port 8080    # in a browser, needs pip install 'hydrotele[web]'
-
-\b
-Keyboard: each key press changes the command of an axis by a quarter of its maximum. The command
-then stays constant; the space bar sets all commands to zero.
-  Up, Down: out, in        Left, Right: swing    Page Up, Page Down: raise, lower
-  End, Home: curl in, out  Insert, Delete: head  7, 6 and 9, 8: additional axes (grab, saw) up, down
-  F10, Ctrl-C or closing the window: stop and write the logs
-
-\b
-Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulder buttons head,
-direction pad additional axes, B switches all off, Start stops. SpaceMouse: push the cap in the
-direction in which the tip must move; its two buttons switch the first two additional axes, both
-together switch all off.
-
-\b
-haptic:HOST:PORT: a device with force output, served there by hydrotele haptic-device. The force
-reflection runs at 1 kHz, separately from the simulation of the machine. --latency prints delays
-and missed deadlines; without --device it starts a simulated device in its own process for 60 s.
-
-\b
---web: a page with the machine, two joysticks, forces and pressures. It reads keyboard and gamepad.
-One page drives, others watch. All commands go to zero if the page that drives sends nothing for
-0.5 s. Only this computer can open the page; for another computer forward the port with
-ssh -L 8080:127.0.0.1:8080 SERVER, or give --host 0.0.0.0, which lets everyone in the network drive.
-"""
-
-
 def drive(
-    scenario: Annotated[str | None, typer.Argument(help="Teleoperated scenario; default: that of the machine.")] = None,
+    scenario: Annotated[
+        str | None, typer.Argument(help="Scenario with a teleoperation pilot. Default: a scenario for the machine.")
+    ] = None,
     machine: Annotated[str | None, typer.Option("--machine", "-m", help="Machine; default: cat215.")] = None,
-    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Name of the mounted tool, for machines with several tools.")
+    ] = None,
     device: Annotated[
         str,
-        typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse, haptic or scripted:FILE."),
+        typer.Option(
+            "--device",
+            "-d",
+            help="Input device: keyboard, gamepad, spacemouse, haptic, haptic:HOST:PORT or scripted:FILE.",
+        ),
     ] = "keyboard",
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")] = None,
-    viewer: Annotated[bool, typer.Option(help="Open the MuJoCo viewer.")] = True,
-    duration: Annotated[float | None, typer.Option(min=1e-3, help="Maximum simulated time [s]; default: 600.")] = None,
-    speed: Annotated[float, typer.Option(min=0.0, help="Simulated time per real time; 0: as fast as possible.")] = 1.0,
-    review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
-    effects: EffectFilesOption = None,
-    latency: Annotated[bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")] = False,
-    web: Annotated[bool, typer.Option("--web", help="Drive in a browser, without a screen on this computer.")] = False,
-    host: Annotated[str | None, typer.Option("--host", help="Interface for --web; default: 127.0.0.1.")] = None,
-    port: Annotated[
-        int | None, typer.Option("--port", min=0, max=65535, help="Port for --web; default: 8080, 0: any.")
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Replace a value of the scenario: KEY=VALUE. Can be given several times."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    viewer: Annotated[bool, typer.Option(help="Open the MuJoCo viewer.")] = True,
+    duration: Annotated[float | None, typer.Option(min=1e-3, help="Longest simulated time [s]. Default: 600.")] = None,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Ratio of simulated to real time; 0 means as fast as possible.")
+    ] = 1.0,
+    review: Annotated[bool, typer.Option(help="Write review.rrd, a recording for `hydrotele review`.")] = True,
+    effects: EffectFilesOption = None,
+    latency: Annotated[
+        bool, typer.Option("--latency", help="Measure and print delays of the force reflection and missed deadlines.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Drive in a browser; this computer needs no screen.")] = False,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            "--host",
+            help="Network address on which the page of --web is served. Default: 127.0.0.1 (this computer only).",
+        ),
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="Port of --web. Default: 8080; 0 means any free port."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
     """Drive a machine in real time; write the same files as `run`."""
     from hydrotele.cli.drive_command import DriveOptions, drive_to_folder
@@ -206,43 +199,23 @@ def drive(
     )
 
 
-SWEEP_EPILOG = """\b
-Examples:  hydrotele sweep servo_gains   |   hydrotele sweep my_sweep.yaml --jobs 8 --out runs/a
-           hydrotele sweep my_sweep.yaml --dask tcp://10.0.0.5:8786
-
-\b
-A sweep file:
-  scenario: zhu_up                                  # shipped, or a file in the same folder
-  set: {effects: [{name: payload, location: tool, parameters: {mass: 0}}]}
-  grid: {servo.position_gain: [3, 4, 5]}            # keys as in run --set; all combinations
-  sample:                                           # combined with each point of the grid
-    count: 20
-    seed: 1
-    keys: {effects.0.parameters.mass: {uniform: [0, 1500]}}   # log_uniform, normal, choice
-  repeat: 2                                         # with successive seeds of the scenario
-  figures: [tracking.tip_z.rms, max_pin_opening_mm]       # plotted; default: a selection
-  logs: false                                       # true: keep the folder of each run
-
-\b
-After an interruption (Ctrl-C, kill), the same command continues with the missing runs. Failed runs
-are listed and appear in the table with the reason. The exit status is 0 if some runs failed and 3
-if all failed.
-"""
-
-
 def sweep(
-    file: Annotated[str, typer.Argument(help="Sweep file (.yaml), or a shipped sweep.")],
+    file: Annotated[str, typer.Argument(help="Sweep file (.yaml), or name of a shipped sweep.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/NAME.")] = None,
     jobs: Annotated[
         int | None,
         typer.Option("--jobs", "-j", min=1, max=MAX_PROCESSES, help="Number of processes; default: one per core."),
     ] = None,
-    dask: Annotated[str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")] = None,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Discard earlier results in the output folder.")] = False,
-    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Repeat failed runs.")] = False,
+    dask: Annotated[
+        str | None, typer.Option(help="Run on a dask cluster: address of its scheduler, or scheduler file.")
+    ] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Delete earlier results in the output folder and start again.")
+    ] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Repeat runs that failed earlier.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with status 3 if any run failed.")] = False,
     effects: EffectFilesOption = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
     """Run variations of a scenario (grid or random samples); collect the results in a table."""
     from hydrotele.cli.run_command import SweepOptions, sweep_to_folder
@@ -273,42 +246,67 @@ app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
 app.add_typer(new_app, name="new")
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 MachineOption = Annotated[
     str | None,
-    typer.Option("--machine", "-m", help="Shipped machine, or a folder with machine.yaml."),
+    typer.Option(
+        "--machine",
+        "-m",
+        help="Name of a shipped machine, or folder with machine.yaml. Default: the machine next to the log,"
+        " or that of its metadata.",
+    ),
 ]
-ToolOption = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
-LogsOption = Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")]
-MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More log files or folders.")]
+ToolOption = Annotated[
+    str | None, typer.Option("--tool", help="Name of the mounted tool, for machines with several tools.")
+]
+LogsOption = Annotated[
+    list[Path],
+    typer.Option("--data", "-d", help="Log file, folder of logs, or run folder (output of `hydrotele run`)."),
+]
+MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More logs, after --data PATH.")]
 HeldOutOption = Annotated[
-    str | None, typer.Option(help="Held-out run; default: test*, else the last; of one run its last quarter.")
+    str | None,
+    typer.Option(
+        help="Run that tests the result and is not fitted. Default: a run whose name begins with test, heldout or"
+        " validation, else the last run; with a single run, its last quarter."
+    ),
 ]
-SensorsOption = Annotated[str | None, typer.Option(help="Sensor set of the machine.")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(help="Sensor set of the machine file, which states rate and accuracy. Default: that of the logs."),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Accept logs whose metadata name another machine or tool.")]
 
 
 @app.command(epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7")
 def run(
-    scenario: Annotated[str, typer.Argument(help="Shipped scenario, or a YAML file.")],
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a shipped scenario (hydrotele list scenarios), or a YAML file.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Replace a value of the scenario: KEY=VALUE. Can be given several times."),
+    ] = None,
     machine: Annotated[
         str | None,
-        typer.Option("--machine", "-m", help="Machine that replaces that of the scenario, e.g. patched/."),
+        typer.Option(
+            "--machine", "-m", help="Machine to simulate instead of that of the scenario, for example gap_logs/patched."
+        ),
     ] = None,
     tool: ToolOption = None,
-    review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
+    review: Annotated[bool, typer.Option(help="Write review.rrd, a recording for `hydrotele review`.")] = True,
     policy: Annotated[
         str | None,
         typer.Option(
             "--policy",
-            help="Policy that replaces the pilot: a file (.zip, .pt, .onnx), MODULE:FUNCTION, FILE.py:FUNCTION or a"
-            " plug-in. It follows the motion of the pilot, and runs with your rights: use only files that you trust.",
+            help="Controller that computes the commands instead of the pilot: a trained policy (.zip, .pt, .onnx),"
+            " MODULE:FUNCTION, FILE.py:FUNCTION or the name of a plug-in. Its reference is the motion of"
+            " the pilot. It is run as Python code, so use only files that you trust.",
         ),
     ] = None,
     task: Annotated[
-        str | None, typer.Option("--task", help="Task with whose observation and actions the policy was trained.")
+        str | None, typer.Option("--task", help="With --policy: task whose observations and actions the policy uses.")
     ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -335,7 +333,7 @@ app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_opera
 
 @app.command(epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay")
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv), folders of them, run folders.")],
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv), folders of logs, or run folders.")],
     machine: MachineOption = None,
     tool: ToolOption = None,
     timestep: Annotated[float, typer.Option(min=1e-6, help="Simulation time step [s].")] = 1.0e-3,
@@ -353,8 +351,10 @@ def replay(
             "--bands",
             min=0,
             max=MAX_BANDS,
-            help="Machines sampled from the posterior, if --machine is a result folder of gap. The 95 % band holds"
-            " parameter uncertainty and measurement noise, not missing laws.",
+            help="Number of machines that are sampled from the posterior, if --machine is a result folder"
+            " of gap. They give a"
+            " 95 % prediction band, which contains parameter uncertainty and measurement noise, but not"
+            " missing effects.",
         ),
     ] = 0,
     effects: EffectFilesOption = None,
@@ -378,26 +378,30 @@ def gap(
     more: MoreLogsArgument = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
-    mjcf: Annotated[Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")] = None,
+    mjcf: Annotated[
+        Path | None, typer.Option("--mjcf", help="Mechanism without hydraulics, as MJCF (.xml), instead of a machine.")
+    ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", help="For a mechanism: assignment of log columns (.yaml)."),
+        typer.Option("--columns", help="With --mjcf: file that assigns log columns to joints and drives (.yaml)."),
     ] = None,
     heldout: HeldOutOption = None,
     sensors: SensorsOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: gap_DATA.")] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option("--effect", help="Test only the effect of this name. Repeatable."),
+        typer.Option("--effect", help="Test only this effect of `hydrotele list effects`. Can be given several times."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
-    mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of parallel processes.")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="CSV file with the columns run, begin and end [s]: intervals that are not used.")
+    ] = None,
     contact: ContactChoice = "mask",
     force: ForceOption = False,
-    recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
+    recording: Annotated[bool, typer.Option(help="Write a recording for `hydrotele review`.")] = True,
     method: Annotated[
         Literal["search", "regression"],
-        typer.Option(help="How effects of a hydraulic machine are searched; regression is experimental."),
+        typer.Option(help="Method for hydraulic machines: search (default), or regression, which is experimental."),
     ] = "search",
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -433,40 +437,63 @@ def identify(
     more: MoreLogsArgument = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
-    mjcf: Annotated[Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")] = None,
+    mjcf: Annotated[
+        Path | None, typer.Option("--mjcf", help="Mechanism without hydraulics, as MJCF (.xml), instead of a machine.")
+    ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
+        typer.Option("--columns", help="With --mjcf: file that assigns log columns to joints and drives (.yaml)."),
     ] = None,
     heldout: HeldOutOption = None,
     sensors: SensorsOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: identify_DATA.")] = None,
-    reduced: Annotated[bool, typer.Option("--reduced", help="Model the links only, without cylinder bodies.")] = False,
-    pins: Annotated[bool, typer.Option("--pins", help="Include friction in passive joints and pins.")] = False,
-    asymmetry: Annotated[bool, typer.Option("--asymmetry", help="Use direction-dependent viscous friction.")] = False,
+    reduced: Annotated[
+        bool, typer.Option("--reduced", help="Model only the links, without the masses of cylinder tubes and rods.")
+    ] = False,
+    pins: Annotated[
+        bool, typer.Option("--pins", help="Also identify friction in joints without drive and in pins.")
+    ] = False,
+    asymmetry: Annotated[
+        bool, typer.Option("--asymmetry", help="Allow viscous friction that differs between the directions.")
+    ] = False,
     hydraulics: Annotated[
-        bool, typer.Option("--hydraulics", help="Also identify valves, oil, leakage and supply.")
+        bool, typer.Option("--hydraulics", help="Also identify valves, oil, leakage and pump.")
     ] = False,
     processing: Annotated[
-        str, typer.Option(help="Filter: zero_phase, optimal, periodic (needs --period) or raw.")
+        str,
+        typer.Option(
+            help="How positions are filtered and differentiated: zero_phase (low-pass without delay), optimal, periodic"
+            " (Fourier series, needs --period) or raw (no filter)."
+        ),
     ] = "zero_phase",
-    band: Annotated[float | None, typer.Option(min=1e-6, help="Compare forces below this frequency [Hz].")] = None,
-    period: Annotated[float | None, typer.Option(min=1e-6, help="Period of a repeated motion [s].")] = None,
+    band: Annotated[float | None, typer.Option(min=1e-6, help="Fit the forces below this frequency only [Hz].")] = None,
+    period: Annotated[float | None, typer.Option(min=1e-6, help="Period of the motion, if it is repeated [s].")] = None,
     harmonics: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Number of harmonics of --period to keep; 0: automatic.")
+        int, typer.Option(min=0, max=10_000, help="Number of harmonics of --period that are kept; 0 means automatic.")
     ] = 0,
     estimator: Annotated[
         str,
-        typer.Option(help="weighted, gauss_markov, least_squares or instruments (needs --period)."),
+        typer.Option(
+            help="Estimator: weighted, gauss_markov, least_squares or instruments (instrumental variables,"
+            " needs --period)."
+        ),
     ] = "weighted",
     keep_bias: Annotated[
-        bool, typer.Option("--keep-bias", help="Do not correct the bias due to position noise.")
+        bool, typer.Option("--keep-bias", help="Do not correct the bias that noise of the positions causes.")
     ] = False,
     ridge: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Ridge term as a fraction of the largest singular value.")
+        float,
+        typer.Option(
+            min=0.0, max=1.0, help="Ridge regularisation, as a fraction of the largest singular value; 0 means none."
+        ),
     ] = 0.0,
     truncate: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Discard singular values below this fraction of the largest.")
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Ignore directions with singular values below this fraction of the largest; 0 means none.",
+        ),
     ] = 0.0,
     contact: ContactChoice = "mask",
     force: ForceOption = False,
@@ -523,7 +550,10 @@ def contact(
     tool: ToolOption = None,
     sensors: SensorsOption = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the masked intervals and logs with the tip force.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder for the CSV file of the intervals and for logs with the estimated tip force."
+        ),
     ] = None,
     force: ForceOption = False,
     effects: EffectFilesOption = None,
@@ -537,19 +567,27 @@ def contact(
 
 @app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")
 def excite(
-    machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file to write (.yaml).")],
+    machine: Annotated[str, typer.Argument(help="Name of a shipped machine, or folder with machine.yaml.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file that is written (.yaml).")],
     tool: ToolOption = None,
-    sensors: SensorsOption = None,
+    sensors: Annotated[
+        str | None,
+        typer.Option(help="Sensor set of the machine file, which states the noise. Default: its first."),
+    ] = None,
     period: Annotated[float, typer.Option(min=1.0, help="Period of the trajectory [s].")] = 20.0,
     harmonics: Annotated[int, typer.Option(min=1, max=30, help="Number of harmonics of the trajectory.")] = 8,
-    starts: Annotated[int, typer.Option(min=1, max=1000, help="Number of searches from random trajectories.")] = 2,
+    starts: Annotated[
+        int,
+        typer.Option(
+            min=1, max=1000, help="Number of searches, each from a random trajectory; the best result is written."
+        ),
+    ] = 2,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the searches.")] = 0,
-    cycles: Annotated[float, typer.Option(min=1.0, max=1e6, help="Number of periods that the scenario runs.")] = 3.0,
+    cycles: Annotated[float, typer.Option(min=1.0, max=1e6, help="Number of periods in the scenario.")] = 3.0,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Design the most informative trajectory within a machine's limits."""
+    """Design the motion from which a machine's parameters can be identified best, within its limits."""
     from hydrotele.cli.identify_command import design_excitation_file
 
     design_excitation_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
@@ -562,7 +600,9 @@ def excite(
     "hydrotele analyse teleop press_direct --set pilot.ratio=2.0e-5",
 )
 def analyse_teleop(
-    file: Annotated[Path | None, typer.Argument(help="Case (.yaml) or scenario; default: a CAT 215 case.")] = None,
+    file: Annotated[
+        Path | None, typer.Argument(help="Case file (.yaml) or scenario. Default: a case of the CAT 215.")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Output folder; default: runs/analyse_NAME, none with --json."),
@@ -571,34 +611,40 @@ def analyse_teleop(
         list[str] | None,
         typer.Option(
             "--structure",
-            help="position_position, position_force, four_channel_position, rate_position, "
+            help="Structure to analyse: position_position, position_force, four_channel_position, rate_position, "
             "rate_force or four_channel_rate; with --robust also wave_variables and "
-            "passivity_control. Repeatable. Default: those of the case.",
+            "passivity_control. Can be given several times. Default: those of the case.",
         ),
     ] = None,
-    delay: Annotated[float | None, typer.Option(min=0.0, help="One-way delay [s]; default: that of the case.")] = None,
+    delay: Annotated[
+        float | None, typer.Option(min=0.0, help="Delay in each direction [s]. Default: that of the case.")
+    ] = None,
     confirm: Annotated[
         bool,
-        typer.Option("--confirm", help="Verify by simulation: sine sweeps and the stability map."),
+        typer.Option("--confirm", help="Verify the result by simulations: sine sweeps and the stability map."),
     ] = False,
     robust: Annotated[
         bool,
-        typer.Option("--robust", help="Include sampling, jitter, random operators and Z-width."),
+        typer.Option(
+            "--robust",
+            help="Also analyse sampling, varying delays, random operators and the Z-width (range of"
+            " displayable impedances).",
+        ),
     ] = False,
     period: Annotated[float, typer.Option(min=1e-6, help="With --robust: sampling period [s].")] = 0.005,
     delays: Annotated[
         Path | None,
-        typer.Option(help="With --robust: CSV of measured delays [s], columns forward and back."),
+        typer.Option(help="With --robust: CSV file of measured delays [s] with the columns forward and back."),
     ] = None,
     operators: Annotated[
         int, typer.Option(min=1, help="With --robust: number of sampled pairs of operator and task.")
     ] = 20,
     coordinate: Annotated[
-        str | None, typer.Option(help="For a scenario: coordinate of the arm: r, theta, z ...")
+        str | None, typer.Option(help="For a scenario: task coordinate that is analysed: r, theta, z, ...")
     ] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="For a scenario: override KEY=VALUE. Repeatable."),
+        typer.Option("--set", help="Replace a value of the scenario: KEY=VALUE. Can be given several times."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -615,37 +661,37 @@ def analyse_teleop(
     "hydrotele review runs/dig --screenshot dig.png --at 8   |   hydrotele review runs/dig --video dig.mp4"
 )
 def review(
-    log: Annotated[Path, typer.Argument(help="Log file, run folder, folder of gap, or recording (.rrd).")],
-    log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
+    log: Annotated[Path, typer.Argument(help="Log file, run folder, result folder of gap, or recording (.rrd).")],
+    log2: Annotated[Path | None, typer.Argument(help="Second log with the same times, for comparison.")] = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording file to write (.rrd).")] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the web viewer.")] = 9090,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording that is written (.rrd).")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Show the run in a browser instead of a window.")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of --serve.")] = 9090,
     screenshot: Annotated[
         Path | None,
-        typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
+        typer.Option("--screenshot", help="Write a PNG image of the viewer; no window is opened."),
     ] = None,
     at: Annotated[
         float | None,
-        typer.Option("--at", help="With --screenshot: displayed time [s]; default: the middle of the log."),
+        typer.Option("--at", help="With --screenshot: displayed time [s]. Default: the middle of the log."),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option("--plot", help="Write a PNG of all channels, or of both logs and their difference."),
+        typer.Option("--plot", help="Write a PNG image of all signals; with two logs, also of their difference."),
     ] = None,
     video: Annotated[
         Path | None,
-        typer.Option("--video", help="Write a video (.mp4) of the machine; needs pip install 'hydrotele[video]'."),
+        typer.Option("--video", help="Write a video of the machine (.mp4); needs pip install 'hydrotele[video]'."),
     ] = None,
     force: ForceOption = False,
     effects: EffectFilesOption = None,
 ) -> None:
     """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.
 
-    A folder with a recording, as that of run or gap, is shown by this recording. Each of --out,
-    --screenshot, --plot and --video writes a file. If one of them is given, no window is opened;
-    several can be given together.
+    If a folder contains a recording, as those of run and gap do, the recording is shown. Each of
+    --out, --screenshot, --plot and --video writes a file. If one of them is given, no window is
+    opened; several can be given together.
     """
     from hydrotele.cli.review_command import ReviewOutputs, review_logs
 
@@ -658,8 +704,8 @@ def list_(
     what: Annotated[
         str | None,
         typer.Argument(
-            help="machines, joysticks, scenarios, sweeps, effects, environments, plugins or all, with their"
-            " descriptions; default: the names only."
+            help="What to list with descriptions: machines, joysticks, scenarios, sweeps, effects,"
+            " environments, plugins or all. Default: the names of everything."
         ),
     ] = None,
     effects: EffectFilesOption = None,
@@ -673,7 +719,9 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps, logs, folders of logs.")],
+    files: Annotated[
+        list[Path], typer.Argument(help="Files or folders of machines, joysticks, scenarios, sweeps or logs.")
+    ],
     machine: MachineOption = None,
     tool: ToolOption = None,
     force: ForceOption = False,
@@ -683,8 +731,8 @@ def validate(
     """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
     Values of a machine file on lines with the comment "# estimate" are listed in the order in which
-    they should be replaced. Logs are checked as by gap, with the column names and ranges of
-    --machine. Default: the machine next to the log, or that of its metadata.
+    they should be replaced. Logs are checked against the column names and ranges of the machine, as
+    gap does.
     """
     from hydrotele.cli.validate_command import LogMachine, validate_files
 
@@ -693,13 +741,15 @@ def validate(
 
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
 def export(
-    machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
+    machine: Annotated[str, typer.Argument(help="Name of a shipped machine or joystick, or its folder.")],
     tool: ToolOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="MJCF file; default: standard output, none with --picture."),
+        typer.Option(
+            "--out", "-o", help="MJCF file that is written. Default: standard output; nothing with --picture."
+        ),
     ] = None,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Write a PNG image.")] = None,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Write a PNG image of the machine.")] = None,
     camera: Annotated[str, typer.Option(help="Camera of the image.")] = "overview",
     effects: EffectFilesOption = None,
 ) -> None:
@@ -709,34 +759,35 @@ def export(
     export_machine(machine, tool, out, picture, camera)
 
 
-IMPORT_EPILOG = """\b
-Examples:  hydrotele import field.mcap --write-mapping field.yaml --machine my_excavator
-           hydrotele import field.mcap --mapping field.yaml --machine my_excavator --out logs
-           hydrotele import bag_folder sensors.mat --merge --out run_1.parquet
-
-\b
-Reads ROS 1 bags (.bag), ROS 2 bags (folder, .db3, .mcap), plain MCAP, MATLAB files (.mat), CSV
-dialects and Parquet. The mapping is `log_columns` of the machine, or of log_columns.yaml next to the
-log, or of --mapping: source column or topic path to channel, unit, scale, sign, offset, wrap, minus.
-Needs pip install 'hydrotele[import]' for bags and MATLAB 7.3.
-"""
-
-
 @app.command("import", epilog=IMPORT_EPILOG)
 def import_(
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of other programs.")],
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs that other programs have written.")],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Parquet file, or folder for several logs; default: the current folder."),
+        typer.Option(
+            "--out", "-o", help="Parquet file that is written, or folder for several logs. Default: the current folder."
+        ),
     ] = None,
-    machine: MachineOption = None,
+    machine: Annotated[
+        str | None,
+        typer.Option("--machine", "-m", help="Machine whose file maps the columns: shipped machine, or folder."),
+    ] = None,
     tool: ToolOption = None,
-    mapping: Annotated[Path | None, typer.Option("--mapping", help="YAML file with log_columns.")] = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", help="YAML file that maps columns or topics to channels (key log_columns)."),
+    ] = None,
     write_mapping: Annotated[
         Path | None,
-        typer.Option("--write-mapping", metavar="FILE.yaml", help="Only propose a mapping of the first log."),
+        typer.Option(
+            "--write-mapping",
+            metavar="FILE.yaml",
+            help="Write a proposed mapping of the first log to this file, and convert nothing.",
+        ),
     ] = None,
-    merge: Annotated[bool, typer.Option("--merge", help="All logs belong to one run.")] = False,
+    merge: Annotated[
+        bool, typer.Option("--merge", help="Merge all logs into one, because they belong to one run.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Convert ROS bags, MCAP, MATLAB and CSV files to logs that all commands read."""
@@ -751,7 +802,7 @@ def import_(
 @app.command("export-log", epilog="Example:  hydrotele export-log runs/zhu_up --mcap zhu_up.mcap")
 def export_log(
     log: Annotated[Path, typer.Argument(help="Log file, folder with one log, or run folder.")],
-    mcap: Annotated[Path, typer.Option("--mcap", help="MCAP file to write.")],
+    mcap: Annotated[Path, typer.Option("--mcap", help="MCAP file that is written.")],
     machine: MachineOption = None,
     tool: ToolOption = None,
     force: ForceOption = False,
@@ -766,7 +817,7 @@ def export_log(
 def experiments(
     name: Annotated[
         str,
-        typer.Argument(help="Document: abdellatif2008, khoshzaban1992, wang2012 or zhu1994."),
+        typer.Argument(help="Publication: abdellatif2008, khoshzaban1992, wang2012 or zhu1994."),
     ],
     out: Annotated[
         Path | None,
@@ -776,17 +827,18 @@ def experiments(
         int | None,
         typer.Option(
             min=1,
-            help="Repetitions (operators, noise seeds or trials); default: 20, or 100 trials.",
+            help="Number of repetitions with other random numbers. Default: 20, or 100 for experiments that"
+            " count trials.",
         ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of parallel processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Repeat the experiments of a publication; compare its tables and figures with simulation.
 
-    Each row states the published value, the simulated one with its 95 % interval, and a verdict:
-    agrees, differs (with the measured reason), undecided, or cannot be computed.
-    The exit status is 1 if a published result differs.
+    Each row states the published value, the simulated one with its 95 % interval, and a verdict. The
+    verdicts are agrees, differs (with the measured reason), undecided (the interval is partly inside and partly
+    outside the accepted range), or cannot be computed. The exit status is 1 if a published result differs.
     """
     from hydrotele.cli.experiments_command import experiments_to_folder
 
@@ -796,18 +848,22 @@ def experiments(
 
 
 @app.command(
-    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json   |   ... --device cpu"
+    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json   |   "
+    "hydrotele bench --device cpu"
 )
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
     compare: Annotated[Path | None, typer.Option("--compare", help="Compare with the results in this file.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions; less accurate.")] = False,
     device: Annotated[
         str | None,
-        typer.Option("--device", help="Measure batches of the reduced model (hydrotele.batch) on cpu or cuda instead."),
+        typer.Option(
+            "--device",
+            help="Measure only many simultaneous simulations of the reduced model (hydrotele.batch), on cpu or cuda.",
+        ),
     ] = None,
-    machine: Annotated[str, typer.Option("--machine", help="Machine of --device.")] = "cat215",
-    tool: Annotated[str | None, typer.Option("--tool", help="Its tool.")] = None,
+    machine: Annotated[str, typer.Option("--machine", help="With --device: machine to measure.")] = "cat215",
+    tool: Annotated[str | None, typer.Option("--tool", help="With --device: tool of this machine.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up."""

@@ -23,14 +23,18 @@ def machine(
     source: Annotated[Path, typer.Option("--from", help="URDF, xacro or MJCF file.")],
     package_path: Annotated[
         list[Path] | None,
-        typer.Option("--package-path", help="Folder with ROS packages, for package:// and $(find ...). Repeatable."),
+        typer.Option(
+            "--package-path",
+            help="Folder with ROS packages, for package:// and $(find ...). Can be given several times.",
+        ),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")] = False,
 ) -> None:
     """Create machine.yaml, MJCF, meshes and a first scenario from a robot description.
 
-    Geometry, joint limits and plausible masses are taken over. Cylinders, valves, pump and implausible
-    masses are estimates of the machine class, marked in machine.yaml and listed by `hydrotele validate`.
+    Geometry, joint limits and plausible masses come from the description. Cylinders, valves, pump and
+    the masses that are implausible there are estimates for machines of this size. They are marked in
+    machine.yaml, and `hydrotele validate` lists them.
     """
     create_machine_folder(name, source, tuple(package_path or ()), json)
 

@@ -21,7 +21,7 @@ COMMAND_GROUPS = {
         "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
         "drive": "Drive a machine in real time; write the same files as `run`.",
         "serve": "Let a client program drive a simulated machine over ZeroMQ; write the same files as `run`.",
-        "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
+        "haptic-device": "Connect a haptic device to `hydrotele drive` over UDP: send its pose, apply forces.",
         "demo": "Simulate an excavator, replay its log and draw the results.",
     },
     "Compare with measurements": {
@@ -32,9 +32,9 @@ COMMAND_GROUPS = {
         "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
     },
     "Identify and calibrate": {
-        "excite": "Design the most informative trajectory within a machine's limits.",
+        "excite": "Design the motion from which a machine's parameters can be identified best, within its limits.",
         "identify": "Identify masses, friction and hydraulics from logs; write the identified machine.",
-        "identify-operator": "Fit the operator model to a tracking log: delay, margins, lag, remnant.",
+        "identify-operator": "Fit the operator model to a log of a tracking task: delay, margins, lag, remnant.",
         "calibrate": "Calibrate the kinematics of a mechanism from measured poses.",
     },
     "Analyse": {

@@ -23,21 +23,32 @@ authentication: listen on addresses other than 127.0.0.1 only in a private netwo
 
 
 def serve(
-    scenario: Annotated[str, typer.Argument(help="Scenario name or YAML file; its pilot is not used.")],
-    realtime: Annotated[bool, typer.Option("--realtime", help="Follow the wall clock instead of lockstep.")] = False,
+    scenario: Annotated[str, typer.Argument(help="Name of a shipped scenario, or a YAML file. Its pilot is not used.")],
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Simulate in real time instead of waiting for the client (lockstep).")
+    ] = False,
     duration: Annotated[
-        float | None, typer.Option(min=0.1, help="Maximum duration [s]; default: that of the scenario.")
+        float | None, typer.Option(min=0.1, help="Longest duration [s]. Default: that of the scenario.")
     ] = None,
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0: any free port.")] = 5620,
+    host: Annotated[str, typer.Option(help="Network address on which the server listens.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 means any free port.")] = 5620,
     timeout: Annotated[
-        float, typer.Option(min=0.01, help="Silence after which a driving client is released [s].")
+        float, typer.Option(min=0.01, help="Time without messages after which the driving client loses control [s].")
     ] = 1.0,
-    machine: Annotated[str | None, typer.Option("--machine", help="Machine instead of that of the scenario.")] = None,
-    tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
+    machine: Annotated[
+        str | None, typer.Option("--machine", help="Machine to simulate instead of that of the scenario.")
+    ] = None,
+    tool: Annotated[
+        str | None, typer.Option("--tool", help="Name of the mounted tool, for machines with several tools.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Override KEY=VALUE. Repeatable.")] = None,
-    review: Annotated[bool, typer.Option("--review/--no-review", help="Write the rerun recording.")] = True,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Replace a value of the scenario: KEY=VALUE. Can be given several times."),
+    ] = None,
+    review: Annotated[
+        bool, typer.Option("--review/--no-review", help="Write a recording for `hydrotele review`.")
+    ] = True,
     json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, and nothing else.")] = False,
 ) -> None:
     """Let a client program drive a simulated machine over ZeroMQ; write the same files as `run`."""

@@ -13,16 +13,16 @@ Examples:  hydrotele train TrackTrajectory --out learned
            hydrotele train ReachFeller --steps 2000000 --out reach   |   hydrotele train --resume --out reach
 
 \b
-PPO of stable-baselines3: pip install 'hydrotele[learn]'. The policy acts alone, from the observation.
-The output folder has policy.zip (stable_baselines3.PPO.load; its input is the observation),
-learning_curve.csv and .png, training.json, scores.json and scores.md. Ctrl-C ends the training and keeps
-the policy; --resume continues it.
+The command needs pip install 'hydrotele[learn]' (PPO of stable-baselines3). The policy computes the
+actions alone, without the reference controller. The output folder contains policy.zip (for
+stable_baselines3.PPO.load), learning_curve.csv and .png, training.json, scores.json and scores.md.
+Ctrl-C ends the training and keeps the policy; --resume continues it.
 
 \b
 Options of the environment (--set) are those of gymnasium.make: action, sensors, control_rate,
-duration, effects, randomise, variants, ... --no-shaping leaves the reward as it is. Without
---no-curriculum, the goals grow during the first 40 % of the training. --device cpu trains on the reduced
-model, which has no contact and is faster; the policy is always evaluated on MuJoCo.
+duration, effects, randomise, variants, ... With the default
+--curriculum, the goals grow during the first 40 % of the training. A policy that was trained with
+--device cpu is evaluated on MuJoCo, too.
 """
 
 RECORD_EPILOG = """\b
@@ -32,39 +32,57 @@ Examples:  hydrotele record TrackTrajectory --episodes 20 --dataset track/refere
            hydrotele record TrackTrajectory --log runs/drive --dataset track/driven-v0
 
 \b
-Needs pip install 'hydrotele[minari]'. minari.load_dataset(NAME) reads the data set; its folder is that of
+The command needs pip install 'hydrotele[minari]'. minari.load_dataset(NAME) reads the data set; its folder is that of
 the variable MINARI_DATASETS_PATH, or ~/.minari/datasets.
 
 \b
-A log (of drive, run, or a real machine) gives one episode: the task starts in the first pose of the log,
-and its valve commands are the actions. The goal is drawn with --seed; observations and rewards are
-those of the simulated task.
+A log (of drive, run, or a real machine) gives one episode. The task starts in the first pose of the
+log, and the valve commands of the log are the actions. --seed selects the goal at random.
+Observations and rewards are those of the simulated task.
 """
 
-TaskArgument = Annotated[str, typer.Argument(help="Task, such as TrackTrajectory, or a gymnasium id.")]
+TaskArgument = Annotated[str, typer.Argument(help="Name of a task, such as TrackTrajectory, or a gymnasium id.")]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", help="Option of the environment KEY=VALUE (YAML). Repeatable.")
+    list[str] | None,
+    typer.Option("--set", help="Option of the environment: KEY=VALUE, the value in YAML. Can be given several times."),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 
 
 def train(
-    task: Annotated[str | None, typer.Argument(help="Task, such as TrackTrajectory, or a gymnasium id.")] = None,
+    task: Annotated[
+        str | None, typer.Argument(help="Name of a task, such as TrackTrajectory, or a gymnasium id.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/train_TASK.")] = None,
     minutes: Annotated[
-        float | None, typer.Option(min=1e-3, help="Duration of the training [min]; default: 30.")
+        float | None, typer.Option(min=1e-3, help="Duration of the training [min]. Default: 30.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps, instead of --minutes.")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of networks and episodes.")] = 0,
-    envs: Annotated[int, typer.Option(min=1, max=4096, help="Parallel environments.")] = 64,
-    threads: Annotated[int, typer.Option(min=0, max=MAX_PROCESSES, help="Threads; 0: one per core.")] = 0,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Length of the training as a number of environment steps, instead of --minutes."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the random numbers (networks and episodes).")
+    ] = 0,
+    envs: Annotated[int, typer.Option(min=1, max=4096, help="Number of parallel environments.")] = 64,
+    threads: Annotated[
+        int, typer.Option(min=0, max=MAX_PROCESSES, help="Number of threads; 0 means one per core.")
+    ] = 0,
     set_: SetOption = None,
-    shaping: Annotated[bool, typer.Option(help="Add the potential-based term to the reward.")] = True,
-    curriculum: Annotated[bool, typer.Option(help="Let the goals grow from 0.2 of their size.")] = True,
-    device: Annotated[Literal["cpu"] | None, typer.Option(help="Train on the reduced model instead of MuJoCo.")] = None,
-    episodes: Annotated[int, typer.Option(min=2, max=4096, help="Episodes of the final comparison.")] = 64,
+    shaping: Annotated[
+        bool,
+        typer.Option(help="Add a potential-based term to the reward, which rewards progress towards the goal."),
+    ] = True,
+    curriculum: Annotated[
+        bool, typer.Option(help="Start the training with goals of 0.2 of their size, and let them grow.")
+    ] = True,
+    device: Annotated[
+        Literal["cpu"] | None,
+        typer.Option(help="Train on the reduced model, which is faster and has no contact, instead of MuJoCo."),
+    ] = None,
+    episodes: Annotated[int, typer.Option(min=2, max=4096, help="Number of episodes of the final comparison.")] = 64,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the output folder.")] = False,
-    video: Annotated[bool, typer.Option("--video", help="Write an episode as episode.mp4.")] = False,
+    video: Annotated[bool, typer.Option("--video", help="Write a video of one episode, episode.mp4.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Train a policy for a control task with PPO; compare it with the reference controller."""
@@ -78,18 +96,32 @@ def train(
 
 def record(
     task: TaskArgument,
-    dataset: Annotated[str, typer.Option("--dataset", help="Name of the data set, such as track/driven-v0.")],
+    dataset: Annotated[str, typer.Option("--dataset", help="Name of the new data set, such as track/driven-v0.")],
     controller: Annotated[
-        Literal["reference", "zero", "random"], typer.Option(help="Controller that acts.")
+        Literal["reference", "zero", "random"],
+        typer.Option(
+            help="Controller that computes the actions: reference (that of the task), zero (no command) or random."
+        ),
     ] = "reference",
     policy: Annotated[
-        Path | None, typer.Option(help="Policy of `train` or stable-baselines3 (.zip) that acts.")
+        Path | None,
+        typer.Option(
+            help="Policy that computes the actions instead: output of `train`, or of stable-baselines3 (.zip)."
+        ),
     ] = None,
     log: Annotated[
-        list[Path] | None, typer.Option("--log", help="Log or run folder whose commands act. Repeatable.")
+        list[Path] | None,
+        typer.Option(
+            "--log", help="Log or run folder whose commands are the actions instead. Can be given several times."
+        ),
     ] = None,
-    episodes: Annotated[int, typer.Option(min=1, max=4096, help="Episodes of a controller or policy.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the first episode.")] = 0,
+    episodes: Annotated[
+        int, typer.Option(min=1, max=4096, help="Number of episodes, for a controller or a policy.")
+    ] = 10,
+    seed: Annotated[
+        int,
+        typer.Option(min=0, max=2**31 - 1, help="Seed of the first episode; each further episode has the next seed."),
+    ] = 0,
     set_: SetOption = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing data set of this name.")] = False,
     json: JsonOption = False,

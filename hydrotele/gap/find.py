@@ -116,14 +116,14 @@ def find_gap(
     *,
     may_exchange: bool = True,
 ) -> Gap:
-    """Find where a model and its logs disagree.
+    """Find the physical effects that explain the difference between a model and its logs.
 
     Args:
-        data: the logs; the fit runs decide, the held-out run judges.
-        progress: called with (what is being done, share done).
-        effects: names of the effects to try; all if empty. If some are named, no law is learned
-            and free runs calibrate nothing: what is lacking may be an effect that was not tried.
-        jobs: processors that it may use.
+        data: the logs; the effects are fitted to the fit runs and tested on the held-out run.
+        progress: called with (name of the present step, completed fraction).
+        effects: names of the effects to test; all if empty. If some are named, no law is learned and
+            open-loop predictions calibrate nothing, because the cause may be an effect that was not tested.
+        jobs: number of processes.
         keep: called with the best answer so far, each time that there is a better one.
         method: `search`, or `regression` of `gap.model_search`.
         warn: called with one sentence per gross error of the logs, before the search.
@@ -131,7 +131,7 @@ def find_gap(
             fitted runs do not show and do not contradict.
 
     Returns:
-        The gap, named or not.
+        The result of the search.
 
     Raises:
         CannotFollowError: the filter of the given machine cannot follow the readings.

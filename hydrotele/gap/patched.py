@@ -39,14 +39,14 @@ def has_patch(gap: Gap) -> bool:
 
 
 def write_patch(gap: Gap, folder: Path) -> None:
-    """Write the patched machine, which `load_machine(folder)` reads, and what was changed.
+    """Write the patched machine, which `load_machine(folder)` reads, and a list of its changes.
 
-    `machine.yaml` is the complete machine; its head says in comments what the effects are.
-    `effects.yaml` has their values, units and 95 % intervals, and the values of the given model;
-    so it has the calibrated numbers and the learned laws.
+    `machine.yaml` is the complete machine; comments at its start name the effects. `effects.yaml`
+    contains the effects, calibrated parameters and learned laws, with values, units, 95 % intervals
+    and the values of the given model.
 
     Args:
-        gap: what the search yields.
+        gap: result of the search.
         folder: an existing folder.
 
     Examples:

@@ -415,39 +415,39 @@ Model = TypeVar("Model")
 
 @dataclass(frozen=True)
 class Gap(Generic[Model]):
-    """Everything the search yields.
+    """Result of a gap search: verdict, effects, corrected machine and the evidence for them.
 
     Attributes:
         machine: the model that was given: a Machine, or the model of a mechanism.
         patched: the model with the named effects; the same object if nothing was named.
         verdict: named, partly, ambiguous, learned, unknown or no_gap.
-        effects: the named effects, the surest first.
-        unknown: what no effect explains, or None.
+        effects: the named effects, the most probable first.
+        unknown: the part of the gap that no effect explains, or None.
         size: the gap on the held-out run before and after.
         ranking: single effects by gain, best first.
         before: predictions of the given model, the held-out run first, then the fit runs.
-        after: the same of the patched model.
+        after: predictions of the patched model, in the same order.
         laws: law -> axis or place -> {"before", "after", "noise"}: RMS balance residuals of the
             held-out run, [unit] as in `law_units`.
         law_units: law -> unit of its residual.
         tests: name of a residual test -> {"value", "limit", "passed"} of the final model.
-        next_experiment: what would separate the alternatives or show the unknown better, or None;
+        next_experiment: motion that would separate the alternatives or show the unknown part better, or None;
             has "reason" and "scenario" (a scenario as a dict).
-        calibration: uncertain number -> what the data ask for, where numbers were calibrated.
-        learned: laws found from the data, in the patched machine.
-        lacks: what the patched machine still lacks, balance by balance, the largest first.
+        calibration: calibrated parameter -> its estimate.
+        learned: laws that were learned from the data and are part of the patched machine.
+        lacks: residual inputs of the patched machine (missing force, flow or command), the largest first.
         noise: channel -> (found, stated) standard deviation of a reading [SI]; NaN if not stated.
         jitter: (found, stated) standard deviation of the instants at which rows are read [s].
-        notes: what was left out or mended in the data, one sentence each.
+        notes: removed and repaired data, one sentence each.
         unused_channels: logged channels that were not used, with the reason, one sentence each.
         seconds: wall time of the search.
-        open_loop: how far the models run away from the measured motion when the measured forces
-            drive them: `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]); or None.
-        answers: per effect its hierarchical answer as of `gap.answer`; None where no method gives it.
-        initial: regressions on measured quantities before the search; None where none were made.
-        explanation: candidates, rejections and residual inputs; None where no search gives them.
-        posterior: samples of the parameters of effects and of calibrated parameters; None without any.
-        differences: parameters that differ between runs, and what the held-out run alone has.
+        open_loop: error of open-loop predictions with the measured forces: `horizon` [s], `before` and
+            `after` (joint -> RMS [rad] or [m]); or None.
+        answers: probabilities of location, family and law of each effect, see `gap.answer`; or None.
+        initial: regressions on measured quantities before the search, or None.
+        explanation: candidates, rejections and residual inputs, or None.
+        posterior: samples of the parameters of effects and of calibrated parameters, or None.
+        differences: parameters that differ between runs, and effects of the held-out run alone.
 
     Examples:
         >>> import tempfile
@@ -504,42 +504,47 @@ class Gap(Generic[Model]):
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
-    """A Gap as strict JSON: plain numbers and texts in SI, null where a number is not finite.
+    """Return a Gap as strict JSON: numbers and texts in SI units, null where a number is not finite.
 
     Args:
-        gap: what the search yields.
+        gap: result of the search.
 
     Returns:
-        `verdict`: named, partly, ambiguous, learned, unknown or no_gap.
-        `effects`: named effects, see `effect_document`; `share` is the part of the held-out run's
-        gap that comes back without the effect, `mechanism_probability` counts alternatives that are
-        the same mechanism in another form (a lag for a delay), and decides the verdict. An effect whose coefficient
-        varies has a `profile`: `variable`, `points` [`variable_unit`], `values` and their `spread`.
-        `calibration`: uncertain number -> `value`, `nominal`, `unit`, `ci95`.
-        `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
-        flow_supply, command), `axis`, `variable`, `other` (a second variable, or empty), `formula`
-        in SI, `points` [`variable_unit`], `values` there and their standard deviations `spread`
-        [`unit`], `resembles` (a library effect or null), `share`, `memory` (a play or a switch in
-        words, or empty), `description`.
-        `unknown`: what no effect explains, or null: `law`, `channel`, `depends_on`, `windows`
-        [s], `description`.
-        `lacks`: what the patched machine still lacks: `balance`, `axis`, standard deviation `size`
-        [`unit`], `part` of the largest that makes sense.
-        `noise`: channel -> `found` and `stated` standard deviation of a reading [SI].
-        `jitter`: `found` and `stated` standard deviation of the instants at which rows are read
-        [s].
-        `gap`: RMS prediction errors `before` and `after`, and `noise_floor`, of the held-out run.
-        `tests`: residual test -> `value`, `limit`, `passed`.
-        `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
-        `next_experiment`: `reason` and `scenario`, or null. `notes`: on the data. `seconds`.
-        `unused_channels`: logged channels that were not used, with the reason.
-        Of a mechanism also `open_loop`: `horizon` [s], `before` and `after` (joint -> RMS [rad] or
-        [m] by which a model runs away within it when the measured forces drive it), or null.
-        Of a machine also `answers`: per effect `sure` (the deepest of place, family and law that is
-        sure), and the probabilities of `places`, `families` there, `laws`, and `none`.
-        `initial_regressions`: regressions on measured quantities before the search, `regressions_document`.
-        `run_differences`: parameters that differ between runs, fields of `RunDifference`.
-        `explanation`: why the verdict, `explanation_document`.
+        Mapping with these keys; the table of `gap.json` in the guide to gap finding explains them further.
+
+        - `verdict`: named, partly, ambiguous, learned, unknown or no_gap.
+        - `effects`: the named effects, see `effect_document`. `share` is the fraction of the held-out run's
+          gap that reappears without the effect. `mechanism_probability` adds the probabilities of
+          alternatives that are the same mechanism with another law (a lag for a delay); it decides the
+          verdict. An effect whose coefficient varies has a `profile`: `variable`, `points`
+          [`variable_unit`], `values` and their standard deviations `spread`.
+        - `calibration`: calibrated parameter -> `value`, `nominal`, `unit`, `ci95`.
+        - `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
+          flow_supply, command), `axis`, `variable`, `other` (a second variable, or empty), `formula`
+          in SI, `points` [`variable_unit`], `values` there and their standard deviations `spread`
+          [`unit`], `resembles` (a library effect or null), `share`, `memory` (backlash operator or relay
+          in words, or empty), `description`.
+        - `unknown`: the part of the gap that no effect explains, or null: `law`, `channel`, `depends_on`,
+          `windows` [s], `description`.
+        - `lacks`: residual inputs of the patched machine: `balance`, `axis`, standard deviation `size`
+          [`unit`], `part` (relative to the largest plausible one).
+        - `noise`: channel -> `found` and `stated` standard deviation of a reading [SI].
+        - `jitter`: `found` and `stated` standard deviation of the sampling instants [s].
+        - `gap`: RMS prediction errors of the held-out run `before` and `after` the correction, and
+          `noise_floor`, that of a perfect model.
+        - `tests`: residual test -> `value`, `limit`, `passed`.
+        - `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
+        - `next_experiment`: `reason` and `scenario`, or null.
+        - `notes`: on the data. `seconds`: duration of the search.
+        - `unused_channels`: logged channels that were not used, with the reason.
+        - `open_loop` (mechanisms only): error of open-loop predictions with the measured forces:
+          `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]), or null.
+        - `answers` (machines only): per effect `sure` (the most detailed of place, family and law that is
+          sure), and the probabilities of `places`, `families` there, `laws`, and `none`.
+        - `initial_regressions`: regressions on measured quantities before the search, see
+          `regressions_document`.
+        - `run_differences`: parameters that differ between runs, fields of `RunDifference`.
+        - `explanation`: reasons of the verdict, see `explanation_document`.
 
     Examples:
         >>> import tempfile

@@ -36,7 +36,7 @@ class Group:
 
 @dataclass
 class Recording:
-    """Groups of a log of another program.
+    """Content of a log of another program: groups of columns, each with its own times.
 
     Attributes:
         path: file or folder.

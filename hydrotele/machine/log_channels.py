@@ -48,11 +48,15 @@ class Channel(NamedTuple):
 MEASURED_KINDS: Mapping[str, ChannelKind] = {
     "time": ChannelKind(("s",), "time of the row", "none"),
     "command": ChannelKind(("1", "V", "N"), "valve command in [-1, 1], drive voltage or force"),
-    "valid": ChannelKind(("1",), "1 if the row may be used, 0 in contact or in masked rows", "none"),
+    "valid": ChannelKind(
+        ("1",), "1 if the row may be used; 0 where the tool is in contact or the row is masked", "none"
+    ),
     "reference": ChannelKind(("rad", "m"), "position reference of the controller"),
     "handle": ChannelKind(("m", "rad"), "displacement of the joystick's handle"),
     "hand_force": ChannelKind(("N", "N m"), "estimated force of the hand on the handle"),
-    "handle_force": ChannelKind(("N", "N m"), "force of the coils on the handle without its weight"),
+    "handle_force": ChannelKind(
+        ("N", "N m"), "force of the coils on the handle, without the part that carries its weight"
+    ),
     "handle_stiffness": ChannelKind(("N/m", "N m/rad"), "stiffness of the joystick's axis"),
     "coil_current": ChannelKind(("A",), "current of a coil of the joystick"),
     "tip_force": ChannelKind(("N", "N m"), "estimated force of the environment on the tip"),
@@ -94,14 +98,16 @@ TRUTH_KINDS: Mapping[str, ChannelKind] = {
     "speed": MEASURED_KINDS["speed"],
     "pressure_load": ChannelKind(("Pa",), "pressure in the load cylinder of an axis"),
     "spool": ChannelKind(("1",), "spool position relative to its stroke"),
-    "spool_rate": ChannelKind(("1/s",), "spool speed relative to the stroke"),
-    "bristle": ChannelKind(("1",), "friction force of the bristles relative to the breakaway force"),
+    "spool_rate": ChannelKind(("1/s",), "spool speed, in strokes per second"),
+    "bristle": ChannelKind(("1",), "elastic force of dry friction (presliding) relative to the breakaway force"),
     "delivery": ChannelKind(("1",), "flow setting of the pump relative to its largest flow", "optional"),
-    "added_delivery": ChannelKind(("1",), "flow added by terms relative to the largest flow", "optional"),
-    "memory": ChannelKind(("1",), "internal state of a term: backlash over half width, or relay 0 to 1"),
+    "added_delivery": ChannelKind(("1",), "pump flow that `terms` add, relative to the largest flow", "optional"),
+    "memory": ChannelKind(
+        ("1",), "internal state of a term: output of a backlash operator over its half width, or relay (0 off, 1 on)"
+    ),
     "flow_head": ChannelKind(("m^3/s",), "valve flow into the head side chamber"),
     "flow_rod": ChannelKind(("m^3/s",), "valve flow into the rod side chamber"),
-    "flow_supply": ChannelKind(("m^3/s",), "flow of the valves of a pump", "optional"),
+    "flow_supply": ChannelKind(("m^3/s",), "flow from a pump into its valves", "optional"),
     "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
     "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
     "contact_force": ChannelKind(("N",), "contact force of ground and objects on the machine, world frame", "xyz"),

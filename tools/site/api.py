@@ -43,9 +43,10 @@ def list_pages() -> dict[str, str]:
     """Return {path of the page: its text}."""
     parts = [
         "# Python API",
-        "`import hydrotele` gives these names; each is imported when it is first used. Units are SI, angles in radians."
-        " [From Python](../api.md) is a short overview; [Custom effects](../effects.md) explains the names of"
-        " `hydrotele.effects`.",
+        "This page lists the public functions and classes, by topic. Each entry gives arguments with shapes and units,"
+        " the result, errors, and an example. Units are SI, angles in radians; `(n, 3)` is the shape of an array.",
+        "`import hydrotele` gives all names except those of `hydrotele.effects`. [From Python](../api.md) is a short"
+        " overview; [Custom effects](../effects.md) explains the names of `hydrotele.effects`.",
     ]
     groups = {title: [f"hydrotele.{name}" for name in names] for title, names in TOPICS.items()}
     groups["Definition of effects"] = [f"hydrotele.effects.{name}" for name in EFFECT_NAMES]

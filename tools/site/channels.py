@@ -11,25 +11,29 @@ def format_page() -> str:
     units = "\n".join(f"| {unit} | {si} | {factor:.6g} |" for unit, (si, factor) in UNITS.items())
     return f"""# Log channels
 
-A channel is one column of a log. Its name is `kind.axis`, such as `angle.boom`, or a kind alone, such as `time`.
-Each value is a float64 in the SI unit of the table; where two units are listed, the first is that of rotary axes.
-[Logs of a real machine](../logs.md) describes files.
+A channel is one column of a log. This page lists all channels that hydrotele writes or reads, and the units that a
+file may state. Your own log needs only some of them; [Logs of a real machine](../logs.md) says which.
+
+The name of a channel is its kind and an axis, such as `angle.boom` (`AXIS` below), or a kind alone, such as `time`.
+Values are floating-point numbers in the SI unit of the table. Where a row has several units, the axis decides:
+rad and N m for rotary, m and N for linear axes. `PUMP` is the name of a pump of a machine with several pumps.
 
 ## Measured channels
 
-Sensor readings and signals of the controller.
+Sensor readings and signals of the controller, in `measured.parquet` of a simulated run and in logs of real machines.
 
 {_format_table(MEASURED_KINDS, "")}
 
 ## True values
 
-Quantities that only a simulator knows, in `truth.parquet` of a run.
+Exact values without sensor errors, which only a simulator knows, in `truth.parquet` of a simulated run. `gap` and
+`identify` do not use them.
 
 {_format_table(TRUTH_KINDS, "truth.")}
 
 ## Units that files may state
 
-A column with one of these units is converted to the SI unit.
+A file may state one of these units for a column, for example `angle.boom [deg]`. Values are multiplied by the factor.
 
 | unit | SI unit | factor |
 | --- | --- | ---: |

@@ -28,13 +28,14 @@ from hydrotele.teleop.operator_parameters import Operator, OperatorFile
 
 
 class FileKind(NamedTuple):
-    """A kind of file: the class of its content, its title, and what it is for.
+    """A kind of file: the class of its content, its title, its content in a few words, and what it is for.
 
     `set_by_program` are the keys of the class that a file does not have.
     """
 
     model: type[BaseModel]
     title: str
+    content: str
     purpose: str
     set_by_program: tuple[str, ...] = ()
 
@@ -60,6 +61,9 @@ FILE_KINDS = {name: FileKind(model=model, **TEXTS["files"][name]) for name, mode
 KEYS: dict[str, dict[str, str]] = TEXTS["keys"]
 """Class name -> key -> its meaning with the unit, where no docstring has it; `any` holds keys of every class."""
 
+SECTION_TEXTS: dict[str, str] = TEXTS["sections"]
+"""Class name -> text above its table, which replaces that of the docstring."""
+
 SENTENCE = re.compile(r"(?<=[.:])\s+(?=[A-Z`])")
 ATTRIBUTE = re.compile(r"^ {4}(?P<key>\w+): (?P<text>.*(?:\n {8}.*)*)", re.M)
 MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc__ or "").partition("\n\n")[2]}
@@ -67,7 +71,7 @@ MORE_DOCSTRINGS = {"OperatorSettings": "\n\n" + inspect.cleandoc(Operator.__doc_
 ITEM = re.compile(r"- (?P<names>`\w+`(?:, `\w+`)*)(?P<unit> \[[^\]]*\](?: or \[[^\]]*\])?)?: (?P<text>.*)")
 UNIT = r"\[(?P<unit>[^\]\s,][^\],]*)\](?:\s+or\s+\[(?P<other>[^\],]+)\])?"
 STATED_UNIT = re.compile(rf"\s*{UNIT.replace('?P<unit>', '').replace('?P<other>', '')}")
-NOT_UNITS = ("low", "values", "mean", "x", "command_unit")
+NOT_UNITS = ("unit", "low", "values", "mean", "x", "command_unit")
 
 
 class Key(NamedTuple):
@@ -143,6 +147,7 @@ def _make_section(name: str, schema: dict[str, Any], paths: tuple[str, ...], ski
     for key, entry in (KEYS.get("any", {}) | KEYS.get(name, {})).items():
         if key in properties and (key not in described or key in KEYS.get(name, {})):
             described[key] = entry
+    prose = SECTION_TEXTS.get(name, prose).strip()
     required = schema.get("required", ())
     keys = tuple(
         Key(
@@ -214,6 +219,11 @@ def find_unit(key: str, meaning: str, text: str) -> str:
     return " or ".join(u for u in (match["unit"], match["other"]) if u)
 
 
+def _title(name: str) -> str:
+    """Return the heading of the section of a class."""
+    return name.lstrip("_")
+
+
 def _is_numeric(facts: dict[str, Any]) -> bool:
     text = json.dumps(facts)
     return '"number"' in text
@@ -222,7 +232,7 @@ def _is_numeric(facts: dict[str, Any]) -> bool:
 def _describe_type(facts: dict[str, Any]) -> str:
     if "$ref" in facts:
         name = facts["$ref"].rpartition("/")[2]
-        return f"[{name}](#{name.lower()})"
+        return f"[{_title(name)}](#{_title(name).lower()})"
     options = facts.get("anyOf") or facts.get("oneOf") or facts.get("allOf")
     if options:
         names = [_describe_type(option) for option in options if option.get("type") != "null"]
@@ -264,12 +274,15 @@ def _describe_values(facts: dict[str, Any]) -> str:
             if name in option and abs(option[name]) < MAX_MAGNITUDE:
                 parts.append(f"{sign} {option[name]:g}")
         if "prefixItems" not in option:
-            for name, words in (("minItems", "at least"), ("maxItems", "at most")):
+            limits = (("minItems", "at least"), ("maxItems", "at most"))
+            if option.get("minItems", 0) > 1 and option["minItems"] == option.get("maxItems"):
+                limits = (("minItems", "exactly"),)
+            for name, words in limits:
                 if name in option:
                     parts.append(f"{words} {option[name]} {'entry' if option[name] == 1 else 'entries'}")
         items = option.get("items") or next(iter(option.get("prefixItems", ())), None) or _find_entry(option)
         if items and (inner := _describe_values(items)):
-            parts.append(f"each {inner}")
+            parts.append(inner if inner.startswith("each ") else f"each {inner}")
         if parts:
             alternatives.append(", ".join(parts))
     return " or ".join(dict.fromkeys(alternatives))
@@ -283,13 +296,17 @@ def format_page(kind: FileKind) -> str:
         kind.purpose.strip(),
         f"Values are in SI units and angles in radians. A key may have a unit as a suffix instead ({suffixes}), such as"
         f" `relief_pressure_bar: 280`; for `{ANGULAR_FREQUENCY_KEYS[0]}` the suffix `_hz` stands for 2π rad/s.",
+        "Each row of a table is a key. The column *value* states its type, its unit in brackets, valid values and the"
+        " default. Keys without **required** may be omitted. A link leads to the table of the keys inside this value."
+        " In the path of a key, `NAME` is a name that you choose, such as that of an axis, and `[]`"
+        " stands for an entry of a list.",
     ]
     for section in read_sections(kind):
         outermost = section.paths == ("",)
-        parts.append(f"## {'Keys of the file' if outermost else section.name}")
+        parts.append(f"## {'Keys of the file' if outermost else _title(section.name)}")
         if not outermost:
             shown = [f"`{path}`" for path in section.paths[:4]]
-            parts.append(f"At {', '.join(shown)}{' and others' if len(section.paths) > 4 else ''}.")
+            parts.append(f"Value of {', '.join(shown)}{' and others' if len(section.paths) > 4 else ''}.")
         parts.append(section.text)
         rows = ["| key | value | meaning |", "| --- | --- | --- |"]
         for key in section.keys:

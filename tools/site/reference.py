@@ -19,10 +19,23 @@ LINK = re.compile(r"\]\((?!https?:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 
 INDEX = """# Reference
 
-Everything on these pages is generated from the program.
+These pages define every key of a file, column of a log, effect, option of a command and function of the Python API.
+The pages are generated from the program, so they describe the installed version.
+
+| page | content |
+| --- | --- |
+| [Files and their keys](files/index.md) | all keys of machines, scenarios, sweeps and other YAML files |
+| [Log channels](channels.md) | all columns that a log may have, and units |
+| [Effects](effects/index.md) | physical phenomena that can be simulated, and found in logs, with equations |
+| [Commands](commands/index.md) | all commands of `hydrotele` with their options |
+| [Python API](python.md) | functions and classes |
+| [Machines](machines/index.md) | the models that hydrotele contains, with the sources of their parameters |
+| [Example of a package with plug-ins](plugin_example.md) | your own effects, tasks, pilots and importers as a package |
+| [Scripts](tools.md) | scripts of the source code that repeat studies and tests |
+| [Changelog](changelog.md), [contributing](contributing.md) | for developers |
 
 ```{toctree}
-:maxdepth: 1
+:hidden:
 
 files/index
 channels
@@ -36,6 +49,23 @@ changelog
 contributing
 ```
 """
+
+
+MODELS = {
+    "cat215": "Caterpillar 215, excavator with bucket or log grapple (hydraulic)",
+    "cat325": "Caterpillar 325, feller-buncher: a machine that fells trees (hydraulic)",
+    "ec20": "Volvo EC20, mini excavator (hydraulic)",
+    "rig": "test rig: one cylinder that pushes a mass (hydraulic)",
+    "calibrator": "CAT 215 with the external calibrator of Khoshzaban 1992",
+    "eha": "electro-hydraulic actuator: a cylinder with its own pump",
+    "emps": "electric positioning system, without hydraulics",
+    "joystick": "magnetically levitated joystick with force reflection",
+    "palida": "PaLiDA, electric hexapod (parallel robot) of Abdellatif 2008",
+    "iwr": "serial-parallel robot of Wang 2012",
+    "panda": "Franka Panda, robot arm of a public record",
+    "robots": "geometry of robot arms, for `hydrotele calibrate mukca`",
+}
+"""Folder in models/ -> what it is."""
 
 
 def copy_page(file: Path, page: Path) -> str:
@@ -53,17 +83,25 @@ def list_repository_pages(folder: Path) -> dict[str, str]:
     pages = {page: copy_page(ROOT / file, folder / page) for file, page in PAGES.items()}
     names = "\n".join(Path(page).stem for page in pages if page.startswith("machines/"))
     pages["machines/index.md"] = (
-        "# Machines\n\nModels that hydrotele contains, with the sources of their parameters. `hydrotele list"
-        " machines` lists those that"
-        f" commands accept.\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
+        "# Machines\n\nModels that hydrotele contains. Each page describes a model and the sources of its"
+        " parameters. `hydrotele list machines` lists the machines that commands accept.\n\n"
+        "| page | model |\n| --- | --- |\n"
+        + "\n".join(f"| [{name}]({name}.md) | {text} |" for name, text in MODELS.items())
+        + f"\n\n```{{toctree}}\n:hidden:\n\n{names}\n```\n"
     )
     return pages
 
 
 def list_file_index() -> dict[str, str]:
     """Return the index of the pages on files."""
+    rows = "\n".join(f"| [{kind.title}]({name}.md) | {kind.content} |" for name, kind in files.FILE_KINDS.items())
+    text = (
+        "# Files and their keys\n\nhydrotele reads YAML files. Each page lists all keys of one kind of file with type,"
+        " unit, valid values and default. `hydrotele validate FILE` checks machines, joysticks, scenarios and sweeps,"
+        f" and reports errors with their line.\n\n| file | content |\n| --- | --- |\n{rows}\n\n"
+    )
     names = "\n".join(files.FILE_KINDS)
-    return {"files/index.md": f"# Files and their keys\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"}
+    return {"files/index.md": f"{text}```{{toctree}}\n:hidden:\n\n{names}\n```\n"}
 
 
 def write_pages(pages: dict[str, str], folder: Path) -> int:
