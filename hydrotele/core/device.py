@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
-from numba.types import Array, BaseTuple, IntegerLiteral, float64
+from numba.core import types as numba_types
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.target_processor import Dispatcher
@@ -83,8 +83,8 @@ def _make_allocation(as_zeros: bool) -> Any:
 
     @extending.intrinsic
     def allocate(typingctx, shape):
-        parts = shape.types if isinstance(shape, BaseTuple) else (shape,)
-        if not all(isinstance(part, IntegerLiteral) for part in parts):
+        parts = shape.types if isinstance(shape, numba_types.BaseTuple) else (shape,)
+        if not all(isinstance(part, numba_types.IntegerLiteral) for part in parts):
             return None
         sizes = [part.literal_value for part in parts]
 
@@ -101,7 +101,7 @@ def _make_allocation(as_zeros: bool) -> Any:
             )  # fmt: skip
             return array._getvalue()
 
-        return Array(float64, len(sizes), "C")(shape), codegen
+        return numba_types.Array(numba_types.float64, len(sizes), "C")(shape), codegen
 
     return allocate
 
