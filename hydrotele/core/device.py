@@ -83,7 +83,7 @@ def _make_allocation(as_zeros: bool) -> Any:
 
     @extending.intrinsic
     def allocate(typingctx, shape):
-        parts = shape.types if isinstance(shape, numba_types.BaseTuple) else (shape,)
+        parts = shape.types if isinstance(shape, numba_types.Tuple | numba_types.UniTuple) else (shape,)
         if not all(isinstance(part, numba_types.IntegerLiteral) for part in parts):
             return None
         sizes = [part.literal_value for part in parts]
