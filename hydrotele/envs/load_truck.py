@@ -348,7 +348,7 @@ def write_load_observation(f, e, w, out, at):
     Source: `list_load_observation_fields`; the position of the edge follows from the measured joint angles.
     """
     g, surface, load, pose = e.goal, soil_surface_view(w), load_view(w), np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
     out[at] = wrap_angle(g[BANK_AZIMUTH] - pose[1])
     out[at + 1] = wrap_angle(math.atan2(TRUCK_Y, TRUCK_X) - pose[1])

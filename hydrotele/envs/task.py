@@ -274,7 +274,7 @@ def compute_path_effort(f, start, change):
     Source: `kinematics.task_space`.
     """
     k = f.arm_axes
-    pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(k), np.empty(k)
+    pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)[:k], np.empty(MAX_ARM_AXES)[:k]
     worst = 0.0
     for n in range(_PATH_SEGMENTS + 1):
         for c in range(MAX_ARM_AXES):
@@ -308,7 +308,7 @@ def compute_measured_pose(f, e, pose):
 
     Source: `kinematics.task_space.compute_tip_pose`.
     """
-    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
 
 
 RECOVERY_SPEED = 0.5  # m/s, speed at which potentials assume that an error decreases
