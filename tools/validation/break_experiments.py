@@ -80,11 +80,14 @@ def format_introduction(name: str, count: int, failures: int) -> list[str]:
         "  range; \"partly outside\" those whose intervals are partly inside.",
         "- Verdict: *differs* if at least one quantity is outside, or is not a finite number (`inf`, `nan`).",
         "- A row may differ in the comparison, too. Its fault then shows only that the fault does not make it agree.",
-        "- Names of quantities are those without the fault. If a name contradicts the fault, the fault applies.",
+        "- The name of a quantity describes the simulation without the fault. The fault is present also where the"
+        " name states the opposite.",
         "- `inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
         " not exist in a repetition, or has no definition, because",
-        "  the repetitions have no scatter. Very large numbers occur if the fault makes a scatter or a denominator"
-        " almost zero, or if an estimate diverges.", "",
+        "  the repetitions have no scatter.",
+        "- Very large numbers, such as a distance of 1e+14 standard deviations, have no physical meaning: the fault"
+        " makes the scatter or denominator almost zero, or an",
+        "  estimate diverges. Only the verdict counts.", "",
         "| row | fault | simulated with the fault | range that agrees | verdict |", "| --- | --- | --- | --- | --- |",
     ]  # fmt: skip
 
