@@ -5,7 +5,7 @@ chains, hydraulic circuit, command delays and sensors. Contacts with the ground 
 part of the reduced model; `hydrotele.envs` simulates these with MuJoCo.
 """
 
-from hydrotele.batch.batch import Batch
+from hydrotele.batch.batch import Batch, as_dlpack
 from hydrotele.batch.machine_step import Machines, Noise, Timing
 
-__all__ = ["Batch", "Machines", "Noise", "Timing"]
+__all__ = ["Batch", "Machines", "Noise", "Timing", "as_dlpack"]

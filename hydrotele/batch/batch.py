@@ -4,13 +4,14 @@ import hashlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 from numba.extending import intrinsic
 
 from hydrotele.batch import machine_step
-from hydrotele.batch.machine_step import Machines, Noise, Timing, make_lanes, store_linkage
+from hydrotele.batch.machine_step import NO_TASK, Machines, Noise, Task, Timing, make_lanes, store_linkage
 from hydrotele.batch.mechanism_code import PROGRAMS, MechanismCode, trace_mechanism
 from hydrotele.core.compiled import compile_without_allocation
 from hydrotele.core.device import rebuild_function
@@ -42,30 +43,6 @@ _MECHANISM_PARAMETERS = ("shape", "joint", "gravity")
 LANES = 8  # machines per block on the CPU: two vectors of four numbers
 
 
-class Task(NamedTuple):
-    """Functions that run in the step of each machine, in the same compiled code, and their arrays.
-
-    Attributes:
-        before: compiled function with the arguments of `machine_step.before_period`.
-        after: compiled function with the arguments of `machine_step.after_period`.
-        arrays: NamedTuple of arrays, the first argument of both; their first dimension is 1 or the number of
-            machines.
-    """
-
-    before: Any
-    after: Any
-    arrays: Any
-
-
-class NoTask(NamedTuple):
-    """Arrays of a batch without a task."""
-
-    unused: np.ndarray
-
-
-NO_TASK = Task(machine_step.before_period, machine_step.after_period, NoTask(np.zeros(1)))
-
-
 class Batch:
     """Machines simulated by the reduced model of the estimator, with the laws of the MuJoCo plant.
 
@@ -82,6 +59,9 @@ class Batch:
         axes: names of the nu drives in the order of the commands.
         state_names: names of the n states.
         machines: state of all machines; arrays of the device.
+        model: Model with one row of parameters, or one per machine; arrays of the device.
+        task: the task.
+        task_arrays: arrays of the task; arrays of the device.
     """
 
     def __init__(
@@ -121,8 +101,8 @@ class Batch:
         self.axes, self.state_names = tuple(actuator_order(self.machine)), state_names(self.machine)
         models = [reduced_model(variant, self.channels) for variant in variants]
         _require_equal_structure(models, self.channels)
-        self._single, self._task = models[0], task
-        self._model: Any = _stack_models(models, count)
+        self._single, self.task = models[0], task
+        self.model: Any = _stack_models(models, count)
         self._timing = _make_timing(self._single, period, timestep, rate_limit)
         self._noise = _make_noise(self.machine, sensors, self.channels, period)
         start = options.get("start")
@@ -133,15 +113,12 @@ class Batch:
         if device == "cuda":
             from hydrotele.batch.cuda_kernel import CudaRunner
 
-            self._runner: Any = CudaRunner(self._single, self._model, task, self.machine.terms)
-            self.machines = self._runner.upload(self.machines)
-            self._model, self._noise = self._runner.upload(self._model), self._runner.upload(self._noise)
-            self._timing, self._arrays = self._runner.upload(self._timing), self._runner.upload(task.arrays)
+            self._runner: Any = CudaRunner(self._single, self.model, task, self.machine.terms)
         else:
-            self._runner, self._arrays = (
-                _ThreadRunner(self._single, self._model, task, options.get("threads", 0)),
-                task.arrays,
-            )
+            self._runner = _ThreadRunner(self._single, self.model, task, options.get("threads", 0))
+        self.machines, self.model, self._noise, self._timing, self.task_arrays = map(
+            self._runner.upload, (self.machines, self.model, self._noise, self._timing, task.arrays)
+        )
 
     @property
     def state(self) -> Any:
@@ -165,8 +142,8 @@ class Batch:
             (m, c) readings, an array of the device that the next step overwrites.
         """
         if commands is not None:
-            self._runner.assign(self.machines.command, commands)
-        self._runner.run(self._model, self.machines, self._noise, self._timing, self._arrays, periods)
+            self.assign(self.machines.command, commands)
+        self._runner.run(self.model, self.machines, self._noise, self._timing, self.task_arrays, periods)
         return self.machines.reading
 
     def reset(self, mask: np.ndarray | None = None, start: np.ndarray | None = None) -> None:
@@ -185,6 +162,24 @@ class Batch:
             write(array, chosen, 0.0)
         for array in (m.period_count, m.failed):
             write(array, chosen, 0)
+
+    def launch(self, function: Any, *arguments: Any) -> None:
+        """Run a compiled function on the CUDA device for each element k of its last array: `function(*arguments, k)`.
+
+        Args:
+            function: compiled function of a task.
+            arguments: arrays of the CPU, which are copied to the device, and NamedTuples of arrays of the device.
+        """
+        self._runner.launch(function, *arguments)
+
+    def assign(self, array: Any, values: Any) -> None:
+        """Copy values into an array of the device: those of one row to all rows, or a matrix.
+
+        Args:
+            array: matrix of the device.
+            values: array of the CPU, or of the device; the latter are copied on the device.
+        """
+        self._runner.assign(array, values)
 
     def synchronise(self) -> None:
         """Wait until the device has done all steps; `step` does not wait on a CUDA device."""
@@ -207,13 +202,26 @@ class Batch:
         if name not in PARAMETERS:
             raise InputError("batch", f"has no parameter {name!r}: {', '.join(PARAMETERS)}")
         inside = name in _MECHANISM_PARAMETERS
-        owner = self._model.mech if inside else self._model
+        owner = self.model.mech if inside else self.model
         values = getattr(owner, name)
         if len(values) != self.count:
             values = self._runner.repeat(values, self.count)
             owner = owner._replace(**{name: values})
-            self._model = self._model._replace(mech=owner) if inside else owner
+            self.model = self.model._replace(mech=owner) if inside else owner
         return values
+
+
+def as_dlpack(array: Any) -> Any:
+    """Return a view of an array of a batch with the DLPack protocol, for `from_dlpack` of PyTorch, JAX or CuPy.
+
+    Nothing is copied. The kernels run in the default stream of the device, which PyTorch and CuPy use, too.
+
+    Args:
+        array: array of the CPU, returned as it is, or of a CUDA device.
+    """
+    if isinstance(array, np.ndarray):
+        return array
+    return import_module("cuda.core.utils").StridedMemoryView.from_cuda_array_interface(array, stream_ptr=-1)
 
 
 def rest_machine_state(machine: Machine, model: Model, joints: dict[str, float] | None = None) -> np.ndarray:
@@ -328,6 +336,10 @@ class _ThreadRunner:
             return
         for done in [self._pool.submit(self._function, *job) for job in jobs]:
             done.result()
+
+    def upload(self, record: Any) -> Any:
+        """Return the arrays themselves."""
+        return record
 
     def synchronise(self) -> None:
         """Return at once: `run` waits for its threads."""

@@ -8,15 +8,15 @@ column by column, so that neighbouring threads read neighbouring numbers.
 import functools
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hydrotele.batch import machine_step
-from hydrotele.batch.machine_step import Machines, Noise, Timing
-from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode, trace_mechanism
+from hydrotele.batch.machine_step import NO_TASK, Lanes, Machines, Noise, Task, Timing
+from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, trace_mechanism
 from hydrotele.core.compiled import cache_folder, source_digest
-from hydrotele.core.device import import_cuda, make_device_function
+from hydrotele.core.device import import_cuda, is_simulated, make_device_function
 from hydrotele.core.output import atomic_file
 from hydrotele.core.tracing import make_device_program
 from hydrotele.estimate.reduced_model import Model
@@ -27,61 +27,119 @@ from hydrotele.terms.term import Term
 THREADS_PER_BLOCK = 64
 
 
-def make_cuda_kernel(model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> Any:
-    """Return the CUDA kernel for machines with the structure of a model.
+class Kernels(NamedTuple):
+    """CUDA kernels of a batch, with the arguments (Model, Machines, Noise, Timing, arrays of the task, source).
+
+    Attributes:
+        step: advances the machines; it has the number of control periods as a seventh argument.
+        before: runs the task's function before a control period; None without a task.
+        after: runs the task's function after a control period; None without a task.
+        source: `MechanismCode.parameters`, the sixth argument.
+    """
+
+    step: Any
+    before: Any
+    after: Any
+    source: np.ndarray
+
+
+def make_cuda_kernels(model: Model, stacked: Model, task: Task, terms: Sequence[Term]) -> Kernels:
+    """Return the CUDA kernels for machines with the structure of a model.
 
     Args:
-        model: Model of one machine; the sizes of its work space are constants of the kernel.
+        model: Model of one machine; the sizes of its work space are constants of the kernels.
         stacked: Model whose parameters have a leading dimension for the machines.
-        task: `batch.Task`.
+        task: the task, `machine_step.NO_TASK` for none.
         terms: terms of the machine.
-
-    Returns:
-        (kernel with the arguments (Model, Machines, Noise, Timing, arrays of the task, control periods,
-        `MechanismCode.parameters`), these parameters).
     """
-    cuda = import_cuda()
-    replaced: dict[Any, Any] = {}
+    code, replaced = trace_mechanism(model, stacked), {}
+    lanes = machine_step.make_lanes(model, code, 1)
     replaced |= make_law_functions(terms, lambda function: make_device_function(function, replaced))
-    replaced[machine_step.before_period] = make_device_function(task.before, replaced)
-    replaced[machine_step.after_period] = make_device_function(task.after, replaced)
-    code = trace_mechanism(model, stacked)
     for name in PROGRAMS:
         replaced[getattr(machine_step, f"run_{name}")] = make_device_program(getattr(code, name), ARRAYS)
-    lanes = machine_step.make_lanes(model, code, 1)
+    scope = {"run_block": make_device_function(machine_step.run_block, replaced)}
+    parts = [getattr(code, name).digest for name in PROGRAMS]
+    parts += [repr([term.law for term in terms]), str([law_index(term.law) for term in terms])]
+    laws = [LAWS[term.law].function.__module__ for term in terms]
+    call = "run_block(model, lanes, machines, noise, timing, task, periods, i, 1)"
+    step = _jit_kernel(_kernel_source(lanes, "periods", call), scope, (), laws, parts)
+    if task is NO_TASK:
+        return Kernels(step, None, None, code.parameters)
+    poses = dict.fromkeys(PROGRAMS, code.pose) | {"move": code.move, "correct": code.correct}
+    before = _make_task_kernel(lanes, machine_step.do_before, machine_step.before_period, task.before, {})
+    after = _make_task_kernel(lanes, machine_step.do_after, machine_step.after_period, task.after, poses)
+    return Kernels(step, before, after, code.parameters)
+
+
+def _make_task_kernel(lanes: Lanes, caller: Any, stub: Any, function: Any, programs: dict[str, Any]) -> Any:
+    """Return the kernel that calls a function of a task by `machine_step.run_task`.
+
+    Args:
+        lanes: work space of one machine.
+        caller: function of `machine_step` that calls `stub`.
+        stub: function that stands for that of the task.
+        function: the function of the task.
+        programs: programs that place the mechanism; the others are left out.
+    """
+    replaced: dict[Any, Any] = {}
+    for name, program in programs.items():
+        replaced[getattr(machine_step, f"run_{name}")] = make_device_program(program, ARRAYS)
+    replaced[stub] = make_device_function(function, replaced)
+    replaced[machine_step.do_stage] = make_device_function(caller, replaced)
+    scope = {"run_task": make_device_function(machine_step.run_task, replaced)}
+    source = _kernel_source(lanes, "", "run_task(model, lanes, machines, noise, timing, task, i)")
+    return _jit_kernel(source, scope, (function,), (), [program.digest for program in programs.values()])
+
+
+def _kernel_source(lanes: Lanes, argument: str, call: str) -> str:
+    """Return the source of a kernel that allocates the work space of a machine in its thread and makes a call."""
     arrays = {name: value for name, value in lanes._asdict().items() if name not in ("source", "has_closures")}
-    scope = {
-        "cuda": cuda, "Lanes": machine_step.Lanes, "real": np.float64,
-        "run_block": make_device_function(machine_step.run_block, replaced),
-    }  # fmt: skip
     body = [line for name, array in arrays.items() for line in _local_array(name, array)]
     names = ", ".join(f"{name}={name}" for name in arrays)
-    body += [
-        f"lanes = Lanes({names}, source=source, has_closures={code.has_closures})",
-        "run_block(model, lanes, machines, noise, timing, task, periods, i, 1)",
-    ]
-    head = ["def kernel(model, machines, noise, timing, task, periods, source):", "    i = cuda.grid(1)"]
-    head += ["    if i < machines.state.shape[0]:"]
-    text = "\n".join([*head, *(f"        {line}" for line in body), ""])  # local arrays have constant sizes
-    path = _store_source(text, code, task, terms)
+    body += [f"lanes = Lanes({names}, source=source, has_closures={lanes.has_closures})", call]
+    head = [f"def kernel(model, machines, noise, timing, task, source{', ' * bool(argument)}{argument}):"]
+    head += ["    i = cuda.grid(1)", "    if i < machines.state.shape[0]:"]
+    return "\n".join([*head, *(f"        {line}" for line in body), ""])  # local arrays have constant sizes
+
+
+def make_element_kernel(function: Any) -> Any:
+    """Return a CUDA kernel that calls `function(*arguments, k)` for each element k of its last array argument."""
+    code = getattr(function, "py_func", function).__code__
+    *names, last, _ = code.co_varnames[: code.co_argcount]
+    text = f"def kernel({', '.join([*names, last])}):\n    k = cuda.grid(1)\n"
+    text += f"    if k < {last}.shape[0]:\n        run_element({', '.join([*names, last])}, k)\n"
+    return _jit_kernel(text, {"run_element": make_device_function(function, {})}, (function,))
+
+
+def _jit_kernel(
+    text: str, scope: dict[str, Any], functions: Sequence[Any], modules: Sequence[str] = (), parts: Sequence[str] = ()
+) -> Any:
+    """Return the CUDA kernel with the name `kernel` of a source text, to be stored in the cache folder if possible.
+
+    Args:
+        text: source of the kernel.
+        scope: functions that it calls.
+        functions: compiled functions that it calls, besides those of this package's batch.
+        modules: names of further modules on whose source the code depends.
+        parts: further texts that change with the code.
+    """
+    path = _store_source(text, functions, modules, parts)
+    scope = {"cuda": import_cuda(), "Lanes": Lanes, "real": np.float64, **scope}
     exec(compile(text, path or "<kernel of a batch>", "exec"), scope)
-    return cuda.jit(scope["kernel"], cache=path is not None), code.parameters
+    return import_cuda().jit(scope["kernel"], cache=path is not None)
 
 
-def _store_source(text: str, code: MechanismCode, task: Any, terms: Sequence[Term]) -> str | None:
+def _store_source(text: str, functions: Sequence[Any], modules: Sequence[str], parts: Sequence[str]) -> str | None:
     """Write the source of a kernel to the cache folder and return its path; numba-cuda stores the code next to it.
 
-    The name of the folder depends on all that the code depends on. Returns None, for no cache, with laws or tasks
-    of other packages or without a cache folder.
+    The name of the folder depends on all that the code depends on; the arguments are those of `_jit_kernel`. Returns
+    None, for no cache, with laws or tasks of other packages or without a cache folder.
     """
-    modules = [__name__, *(f.py_func.__module__ for f in (task.before, task.after))]
-    modules += [LAWS[term.law].function.__module__ for term in terms]
+    modules = [__name__, *(f.py_func.__module__ for f in functions), *modules]
     folder = cache_folder()
     if folder is None or any(module.partition(".")[0] != "hydrotele" for module in modules):
         return None
-    parts = [text, *map(source_digest, modules), *(getattr(code, name).digest for name in PROGRAMS)]
-    parts += [f.py_func.__qualname__ for f in (task.before, task.after)] + [repr([term.law for term in terms])]
-    parts += [str([law_index(term.law) for term in terms])]
+    parts = [text, *map(source_digest, modules), *parts, *(f.py_func.__qualname__ for f in functions)]
     path = folder / f"cuda_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}" / "kernel.py"
     try:
         path.parent.mkdir(mode=0o700, exist_ok=True)
@@ -110,13 +168,28 @@ class CudaRunner:
     def __init__(self, model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> None:
         """Make the kernel; it is compiled on its first launch."""
         self._cuda = import_cuda()
-        self._kernel, parameters = make_cuda_kernel(model, stacked, task, terms)
-        self._parameters = self._copy_to_device(parameters)
+        self._kernels = make_cuda_kernels(model, stacked, task, terms)
+        self._source = self._copy_to_device(self._kernels.source)
+        self._element_kernels: dict[Any, Any] = {}
 
     def run(self, model: Model, machines: Machines, noise: Noise, timing: Timing, arrays: Any, periods: int) -> None:
         """Launch the kernel; the call does not wait for its end."""
-        blocks = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
-        self._kernel[blocks, THREADS_PER_BLOCK](model, machines, noise, timing, arrays, periods, self._parameters)
+        grid = (len(machines.state) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK, THREADS_PER_BLOCK
+        kernels, given = self._kernels, (model, machines, noise, timing, arrays, self._source)
+        if kernels.before is None:
+            kernels.step[grid](*given, periods)
+            return
+        for _ in range(periods):
+            kernels.before[grid](*given)
+            kernels.step[grid](*given[:4], NO_TASK.arrays, self._source, 1)
+            kernels.after[grid](*given)
+
+    def launch(self, function: Any, *arguments: Any) -> None:
+        """Run a function for each element of its last array; the call does not wait for its end."""
+        if function not in self._element_kernels:
+            self._element_kernels[function] = make_element_kernel(function)
+        blocks = (len(arguments[-1]) + THREADS_PER_BLOCK - 1) // THREADS_PER_BLOCK
+        self._element_kernels[function][blocks, THREADS_PER_BLOCK](*map(self.upload, arguments))
 
     def synchronise(self) -> None:
         """Wait until the device has done all launched kernels."""
@@ -132,14 +205,18 @@ class CudaRunner:
         if array.size == 0:
             whole = self._cuda.to_device(np.zeros(tuple(max(1, size) for size in array.shape), array.dtype))
             return whole[tuple(slice(size) for size in array.shape)]
-        return self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+        copy = self._cuda.to_device(np.asfortranarray(array) if len(array) > 1 else array)
+        return copy.view(np.recarray) if array.dtype.names and is_simulated() else copy  # for fields as attributes
 
     def assign(self, array: Any, values: Any) -> None:
         """Copy values of the CPU or of the device into an array of the device."""
         if hasattr(values, "__cuda_array_interface__"):
             _copy_values(self._cuda)[64, 128](array, self._cuda.as_cuda_array(values))
+        elif is_simulated():
+            array[...] = values
         else:
-            array.copy_to_device(np.asfortranarray(np.broadcast_to(np.asarray(values, array.dtype), array.shape)))
+            whole = np.broadcast_to(np.asarray(values, array.dtype), array.shape)
+            array.copy_to_device(np.asfortranarray(whole) if len(whole) > 1 else np.ascontiguousarray(whole))
 
     def assign_rows(self, array: Any, rows: np.ndarray, values: Any) -> None:
         """Copy values of the CPU into some rows of an array of the device."""

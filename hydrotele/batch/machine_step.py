@@ -9,7 +9,7 @@ All arrays of a batch have one row per machine. Parameters that are equal for al
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -225,6 +225,13 @@ def restart_machine(model, sp, z, machines, i, start):
     """
     for k in range(len(z)):
         z[k] = machines.start[start, k]
+    restart_history(machines, i, start)
+    load_linkage(model.mech.dependent, sp.motion.joint, sp.motion.basis, machines.linkage[i])
+
+
+@compile_without_allocation
+def restart_history(machines, i, start):
+    """Set all of machine i but its state to a start state; see `restart_machine`."""
     for k in range(machines.linkage.shape[1]):
         machines.linkage[i, k] = machines.start_linkage[start, k]
     for row in range(machines.history.shape[1]):
@@ -233,7 +240,6 @@ def restart_machine(model, sp, z, machines, i, start):
     for c in range(machines.error.shape[1]):
         machines.error[i, c] = 0.0
     machines.period_count[i], machines.failed[i] = 0, 0
-    load_linkage(model.mech.dependent, sp.motion.joint, sp.motion.basis, machines.linkage[i])
 
 
 @compile_without_allocation
@@ -375,6 +381,18 @@ def do_stage(model, sp, z, machines, noise, timing, task, i, stage):
 
 
 @compile_without_allocation
+def do_before(model, sp, z, machines, noise, timing, task, i, stage):
+    """Call `before_period` only; stands for `do_stage` in a kernel of its own, see `run_task`."""
+    before_period(task, model, sp, z, machines, i)
+
+
+@compile_without_allocation
+def do_after(model, sp, z, machines, noise, timing, task, i, stage):
+    """Call `after_period` only; stands for `do_stage` in a kernel of its own, see `run_task`."""
+    after_period(task, model, sp, z, machines, i)
+
+
+@compile_without_allocation
 def run_stage(model, lanes, machines, noise, timing, task, i, lane, stage):
     """Do one stage of a control period of a machine.
 
@@ -429,6 +447,36 @@ def load_parameters(model, lanes, i, lane):
 
 
 @compile_without_allocation
+def load_machine(model, lanes, machines, i, lane):
+    """Copy state, parameters and start of the closed chains' solution of machine i to the work space."""
+    for k in range(lanes.z.shape[1]):
+        lanes.z[lane, k] = machines.state[i, k]
+    load_parameters(model, lanes, i, lane)
+    load_linkage(model.mech.dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[i])
+
+
+@compile_without_allocation
+def store_machine(model, lanes, machines, i, lane):
+    """Copy state and start of the closed chains' solution from the work space to machine i."""
+    store_linkage(model.mech.dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[i])
+    for k in range(lanes.z.shape[1]):
+        machines.state[i, k] = lanes.z[lane, k]
+
+
+@compile_without_allocation
+def run_task(model, lanes, machines, noise, timing, task, i):
+    """Run a function of the task, which stands for `do_stage`, for machine i with its mechanism placed at the state.
+
+    A CUDA device runs the functions of a task in kernels of their own: these compile in a fraction of the time of
+    one kernel with the dynamics, and the kernel with the dynamics is that of all tasks.
+    """
+    load_machine(model, lanes, machines, i, 0)
+    place_block(lanes, 0.0, 0.0, True)
+    run_stage(model, lanes, machines, noise, timing, task, i, 0, START)
+    store_machine(model, lanes, machines, i, 0)
+
+
+@compile_without_allocation
 def run_block(model, lanes, machines, noise, timing, task, periods, first, count):
     """Advance a block of machines by some control periods, with the functions of a task before and after each.
 
@@ -443,13 +491,9 @@ def run_block(model, lanes, machines, noise, timing, task, periods, first, count
         first: index of the first machine.
         count: number of machines, at most that of the lanes; unused lanes compute copies of the last machine.
     """
-    h, dependent = timing.period / timing.steps, model.mech.dependent
+    h = timing.period / timing.steps
     for lane in range(len(lanes.z)):
-        i = first + min(lane, count - 1)
-        for k in range(lanes.z.shape[1]):
-            lanes.z[lane, k] = machines.state[i, k]
-        load_parameters(model, lanes, i, lane)
-        load_linkage(dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[i])
+        load_machine(model, lanes, machines, first + min(lane, count - 1), lane)
     last = FIRST_KICK + timing.steps
     for _ in range(periods):
         for stage in range(last + 2):
@@ -459,9 +503,7 @@ def run_block(model, lanes, machines, noise, timing, task, periods, first, count
             for lane in range(count):
                 run_stage(model, lanes, machines, noise, timing, task, first + lane, lane, stage)
     for lane in range(count):
-        store_linkage(dependent, lanes.joint[lane], lanes.basis[lane], machines.linkage[first + lane])
-        for k in range(lanes.z.shape[1]):
-            machines.state[first + lane, k] = lanes.z[lane, k]
+        store_machine(model, lanes, machines, first + lane, lane)
 
 
 @compile_without_allocation
@@ -470,3 +512,27 @@ def run_machines(model, lanes, machines, noise, timing, task, periods, begin, en
     for first in range(begin, end, len(lanes.z)):
         count = min(len(lanes.z), end - first)
         run_block(model, lanes, machines, noise, timing, task, periods, first, count)
+
+
+class Task(NamedTuple):
+    """Functions that run in the step of each machine, in the same compiled code, and their arrays.
+
+    Attributes:
+        before: compiled function with the arguments of `before_period`.
+        after: compiled function with the arguments of `after_period`.
+        arrays: NamedTuple of arrays, the first argument of both; their first dimension is 1 or the number of
+            machines.
+    """
+
+    before: Any
+    after: Any
+    arrays: Any
+
+
+class NoTask(NamedTuple):
+    """Arrays of a batch without a task."""
+
+    unused: np.ndarray
+
+
+NO_TASK = Task(before_period, after_period, NoTask(np.zeros(1)))

@@ -397,7 +397,9 @@ def format_findings(findings: ScenarioFindings) -> list[tuple[str, str, str]]:
         rows.append(("oscillation frequency", f"{loop.frequency:.2f} Hz", "at the stability limit"))
         rows.append(("dominant pole", f"{pole.real:.3f} {pole.imag:+.3f}j rad/s", "at this ratio"))
     if math.isfinite(loop.max_ratio):
-        why = f"{loop.hand_force:.2f} for {case.force_limit:.0f} {force}, outside the dead band"
+        why = (
+            f"hand force {loop.hand_force:.2f} {force} at {case.force_limit:.0f} {force}, handle outside its dead band"
+        )
         rows.append(("maximum stable ratio", f"{loop.max_ratio:.3g}", why))
     if math.isfinite(loop.max_ratio_with_deadband):
         why = "for an oscillation from stop to stop across the dead band"

@@ -9,12 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import step_references_to_pose
+from hydrotele.control.resolved_motion import POSE_SIZE, step_references_to_pose
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task_space import compute_tip_pose
 
 _MAX_REFERENCE_LEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
-_POSE_SIZE = 5  # r, theta, z, attitude, head
 
 
 @compiled
@@ -89,8 +88,8 @@ def advance_pose_reference(arm, goal, period, joint, pose, pose_rate, q, rates):
 
     Source: `control.resolved_motion`.
     """
-    k, wanted = len(q), np.empty(_POSE_SIZE)
-    for c in range(_POSE_SIZE):
+    k, wanted = len(q), np.empty(POSE_SIZE)
+    for c in range(POSE_SIZE):
         pose_rate[c] = limit_change(pose_rate[c], goal[c], arm.accelerations[c] * period)
         wanted[c] = pose[c] + period * pose_rate[c]
     far = False

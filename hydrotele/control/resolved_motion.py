@@ -23,6 +23,7 @@ from hydrotele.kinematics.task_space import (
 )
 from hydrotele.machine.machine import Machine
 
+POSE_SIZE = 5  # r, theta, z, attitude, head
 _RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: about one control period
 
 
@@ -49,7 +50,7 @@ def step_references_to_pose(arm_constants, ranges, target, rate, blocked, pose, 
     Source: Zhu 1994, chapter 2.
     """
     k = len(q)
-    found = np.empty(k)
+    found = np.empty(POSE_SIZE)[:k]
     held = False
     if blocked:
         for i in range(max(k, 3)):

@@ -57,7 +57,7 @@ def compiled(function):
         >>> round(orifice_pressure_drop(1.0e-3, math.pi * 0.0025**2, 0.6, 870.0) / 1e6, 2)  # MPa
         3.13
     """
-    return _make_dispatcher(function)
+    return _make_dispatcher(function, _nrt=True)  # not inherited from a caller without allocation
 
 
 def compile_without_allocation(function):

@@ -2,11 +2,16 @@
 
 import functools
 import math
+import os
 import types
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+from numba.core import types as numba_types
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.target_processor import Dispatcher
@@ -72,6 +77,35 @@ def import_cuda() -> Any:
     return cuda
 
 
+def _make_allocation(as_zeros: bool) -> Any:
+    """Return the CUDA form of `numpy.empty` or `numpy.zeros`: float64, constant sizes, in the memory of the thread."""
+    extending = import_module("numba.cuda.extending")
+
+    @extending.intrinsic
+    def allocate(typingctx, shape):
+        parts = shape.types if isinstance(shape, numba_types.Tuple | numba_types.UniTuple) else (shape,)
+        if not all(isinstance(part, numba_types.IntegerLiteral) for part in parts):
+            return None
+        sizes = [part.literal_value for part in parts]
+
+        def codegen(context, builder, signature, args):
+            count = math.prod(sizes)
+            data = cgutils.alloca_once(builder, ir.ArrayType(ir.DoubleType(), count))
+            if as_zeros:
+                cgutils.memset(builder, data, ir.IntType(64)(8 * count), 0)
+            array = context.make_array(signature.return_type)(context, builder)
+            strides = [8 * math.prod(sizes[k + 1 :]) for k in range(len(sizes))]
+            context.populate_array(
+                array, data=builder.bitcast(data, array.data.type), itemsize=ir.IntType(64)(8), meminfo=None,
+                shape=[ir.IntType(64)(size) for size in sizes], strides=[ir.IntType(64)(step) for step in strides],
+            )  # fmt: skip
+            return array._getvalue()
+
+        return numba_types.Array(numba_types.float64, len(sizes), "C")(shape), codegen
+
+    return allocate
+
+
 @functools.cache
 def _device_numpy() -> types.ModuleType:
     """Return a module like numpy whose functions of numbers exist on CUDA devices."""
@@ -83,10 +117,17 @@ def _device_numpy() -> types.ModuleType:
     vars(module).update({name: value for name, value in vars(np).items() if not name.startswith("__")})
     vars(module).update({name: getattr(math, name) for name in ("cos", "expm1", "sin", "sqrt")})
     vars(module)["rint"] = import_cuda().jit(device=True)(rint)
+    if not is_simulated():
+        vars(module).update(empty=_make_allocation(False), zeros=_make_allocation(True))
     return module
 
 
 _ROUNDING = 1.5 * 2.0**52  # the sum of this and a number below 2^51 has no fraction
+
+
+def is_simulated() -> bool:
+    """Return whether numba's simulator of CUDA, which runs Python code, stands for a device."""
+    return os.environ.get("NUMBA_ENABLE_CUDASIM") == "1"
 
 
 def make_device_function(dispatcher: Any, replaced: dict[Any, Any]) -> Any:

@@ -7,7 +7,6 @@ results are left out. The program is compiled for one machine, or for several at
 
 import hashlib
 import math
-import os
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from types import FunctionType, ModuleType
@@ -18,7 +17,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from hydrotele.core.device import import_cuda, rebuild_function
+from hydrotele.core.device import import_cuda, is_simulated, rebuild_function
 
 _COMMUTATIVE = {"add", "mul"}
 _SYMBOLS = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -333,7 +332,7 @@ def make_device_program(program: Program, arrays: Sequence[str]) -> Any:
         arrays: names of its arrays.
     """
     cuda = import_cuda()
-    if os.environ.get("NUMBA_ENABLE_CUDASIM") == "1":
+    if is_simulated():
         scope: dict[str, Any] = {"math": math}
         exec(program.python_source("run_program", arrays), scope)
         return cuda.jit(device=True)(scope["run_program"])

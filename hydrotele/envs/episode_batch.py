@@ -114,7 +114,10 @@ class TaskCore:
         truncated: (n,) uint8, whether the last step ended the episode because its duration is over.
         measures: (n, MAX_MEASURES) task measures of the step, reported in `info`.
         final_measures: (n, MAX_MEASURES) the same before an autoreset in the same step.
+        is_on_device: whether these arrays are in the memory of a CUDA device.
     """
+
+    is_on_device = False
 
     def __init__(
         self, task: Task, options: Options, count: int = 1, threads: int = 1,
@@ -202,6 +205,10 @@ class TaskCore:
             return setup.axes
         names = ("r", "theta", "z", "attitude", "head")[: setup.arm_axes]
         return (*names, *setup.axes[setup.arm_axes :])
+
+    def set_difficulty(self, difficulty: float) -> None:
+        """Set the size of the goals of new episodes, see `difficulty` of `envs.task.Options`."""
+        self.parameters["difficulty"] = difficulty
 
     @property
     def bytes_per_environment(self) -> int:

@@ -57,11 +57,11 @@ def _integrate_pose_rates(f, e, action):
     k, goal = f.arm_axes, np.zeros(MAX_ARM_AXES)
     for c in range(k):
         goal[c] = _clip_action(f, action, c) * f.fastest_pose[c]
-    ranges = np.empty(2 * k).reshape((k, 2))
+    ranges = np.empty((MAX_ARM_AXES, 2))[:k]
     q, rates, joint = (
-        arm_values(f, e.reference, np.empty(f.arm_axes)),
-        arm_values(f, e.reference_rate, np.empty(f.arm_axes)),
-        arm_values(f, e.joint, np.empty(f.arm_axes)),
+        arm_values(f, e.reference, np.empty(MAX_ARM_AXES)[: f.arm_axes]),
+        arm_values(f, e.reference_rate, np.empty(MAX_ARM_AXES)[: f.arm_axes]),
+        arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]),
     )
     for a in range(k):
         ranges[a, 0], ranges[a, 1] = f.ranges[f.driven_axis[a], 0], f.ranges[f.driven_axis[a], 1]
@@ -117,7 +117,8 @@ def compute_servo_commands(f, e):
 
     Source: `control.servo`.
     """
-    k, none = f.axes, np.zeros(f.axes)
+    k = f.axes
+    none = np.zeros(MAX_AXES)[:k]
     drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
     measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply[: f.supplies])
     servo_step(
@@ -182,7 +183,7 @@ def initialise_references(f, e):
     for c in range(len(e.pose_rate)):
         e.pose_rate[c] = 0.0
     if f.arm_axes > 0:
-        compute_tip_pose(f.arm, arm_values(f, e.reference, np.empty(f.arm_axes)), e.pose)
+        compute_tip_pose(f.arm, arm_values(f, e.reference, np.empty(MAX_ARM_AXES)[: f.arm_axes]), e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
 

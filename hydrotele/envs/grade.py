@@ -214,7 +214,7 @@ def write_grade_observation(f, e, w, out, at):
     """
     g, surface = e.goal, soil_surface_view(w)
     pose = np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
     for p in range(SECTION_COUNT):
         first = FIRST_CELL + p * _CELLS_PER_SECTION

@@ -408,7 +408,16 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seeds = seeds[chosen]
         self.core.reset(seeds, chosen)
         self._is_started = True
+        if self.core.is_on_device:
+            return self.core.observation, self._device_infos()
         return self.core.observation.copy(), self._make_infos(chosen)
+
+    def _device_infos(self) -> dict[str, Any]:
+        """Return the task measures (n, MAX_MEASURES), and final observations of an autoreset in the same step."""
+        core = self.core
+        if self._autoreset_mode is not AutoresetMode.SAME_STEP:
+            return {"measures": core.measures}
+        return {"measures": core.measures, "final_obs": core.final_observation, "final_measures": core.final_measures}
 
     def _parse_reset_mask(self, options: dict[str, Any] | None) -> np.ndarray | None:
         if not options or "reset_mask" not in options:
@@ -438,7 +447,9 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             actions: (n, a); values outside +-1 are clipped.
 
         Returns:
-            (observations (n, o), rewards (n,), terminations (n,), truncations (n,), infos).
+            (observations (n, o), rewards (n,), terminations (n,), truncations (n,), infos). With `device="cuda"`
+            they are arrays of the device that the next step overwrites, the ends as uint8; see
+            `hydrotele.batch.as_dlpack`.
 
         Raises:
             ValueError: the actions have the wrong shape, or are not finite.
@@ -447,6 +458,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if np.shape(actions) != core.action.shape:
             raise ValueError(f"actions must be {core.action.shape}, not {np.shape(actions)}")
         core.step(actions)
+        if core.is_on_device:
+            return core.observation, core.reward, core.terminated, core.truncated, self._device_infos()
         infos = self._make_infos(None)
         over = (core.terminated | core.truncated).astype(bool)
         if self._autoreset_mode is AutoresetMode.SAME_STEP and over.any():
@@ -476,7 +489,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         self.core.set_state(state, index)
         self._is_started = True
-        return self.core.observation.copy()
+        return self.core.observation if self.core.is_on_device else self.core.observation.copy()
 
     def _make_infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
         there = np.zeros(self.num_envs, bool)

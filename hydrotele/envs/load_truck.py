@@ -348,7 +348,7 @@ def write_load_observation(f, e, w, out, at):
     Source: `list_load_observation_fields`; the position of the edge follows from the measured joint angles.
     """
     g, surface, load, pose = e.goal, soil_surface_view(w), load_view(w), np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
     out[at] = wrap_angle(g[BANK_AZIMUTH] - pose[1])
     out[at + 1] = wrap_angle(math.atan2(TRUCK_Y, TRUCK_X) - pose[1])
@@ -497,9 +497,10 @@ _CYCLE_TASK = Task(
     ),
     reward=(
         "The reward is 10 per m3 in the truck. Every m3 spilled costs 10, every MJ of hydraulic energy 1, every"
-        " second 0.1, and every 10 kN s of force on the truck 1. In addition, the change of a potential rewards"
-        " progress. Each m3 in the bucket has the potential 3, which rises to 7 above the truck. An empty"
-        " bucket has -2 far from the bank and 0 at the bank. Success ends the episode with an additional reward of"
+        " second 0.1, and every 10 kN s of force on the truck 1. In addition, progress is rewarded"
+        " (always, whatever the option `shaping`): the reward contains the change of a value of the state. This value"
+        " is 3 per m3 in the bucket and rises to 7 per m3 above the truck; for an empty bucket it is -2 far from the"
+        " bank and 0 at the bank. Success ends the episode with an additional reward of"
         " 10. In `cycle`, success is a full truck; in `dig`, it is 0.45 m3 in the bucket, lifted 0.3 m above the bank."
         " In `haul`, it is the bucket above the bed with 80 % of its load; in `dump`, an empty bucket with 80 % of its"
         " load in the truck; in `return`, the bucket edge above the bank. A force above 100 kN on the truck ends the"

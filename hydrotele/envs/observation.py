@@ -159,7 +159,7 @@ def write_machine_observation(f, e, out):
             at += 1
     if f.arm_axes > 0:
         pose = np.empty(MAX_ARM_AXES)
-        compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+        compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
         for c in range(max(4, f.arm_axes)):
             out[at] = pose[c]
             at += 1

@@ -285,7 +285,7 @@ def draw_log_poses(f, e, w):
     Source: this module.
     """
     g, pose, at = e.goal, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
-    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
     radius, theta = (
         draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
         pose[1] + _draw_with_random_sign(e, _LOG_ANGLES),

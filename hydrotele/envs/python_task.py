@@ -286,7 +286,7 @@ def make_task_state(f, e, measures):
     for i in range(f.supplies):
         supply[i] = e.supply[i]
     if f.arm_axes > 0:
-        compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), tip_pose)
+        compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), tip_pose)
         for c in range(3):
             tip[c] = e.tip[c]
     return TaskState(

@@ -90,7 +90,7 @@ def draw_reach_goal(f, e):
     Source: this module.
     """
     g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), start)
+    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), start)
     size = f.difficulty
     for n in range(_MAX_DRAWS):
         if n >= _FULL_SIZE_DRAWS:
@@ -139,7 +139,7 @@ def combine_pose_errors(distance, angle):
 
 @compiled
 def _compute_true_pose_errors(f, e):
-    arm = arm_values(f, e.position, np.empty(f.arm_axes))
+    arm = arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes])
     attitude = arm[1] + arm[2] + arm[3]
     target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
     return compute_pose_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, arm[4])
@@ -219,7 +219,7 @@ def compute_reach_potential(f, e):
     Source: this module.
     """
     pose = np.empty(MAX_ARM_AXES)
-    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
     time = HOLD_TIME - e.goal[_TIME_HELD]
     for c in range(MAX_ARM_AXES):
         error = pose[c] - e.goal[_TARGET + c]

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.batch.batch import PARAMETERS, Batch
-from hydrotele.batch.batch import Task as BatchTask
+from hydrotele.batch.machine_step import Task as BatchTask
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import STEP
 from hydrotele.envs.episode_batch import MAX_THREADS, TaskCore, check_count, make_task_setup
@@ -33,6 +33,8 @@ MAX_MACHINES = 1_000_000
 """Largest number of parallel episodes on the reduced model."""
 _VARIED = ("shape", "joint", "gravity", "user", "gain", "delay", "transmission")
 _MECHANISM = ("shape", "joint", "gravity")
+_EPISODE_ARRAYS = ("episodes", "action", "observation", "final_observation", "reward", "terminated", "truncated",
+                   "measures", "final_measures")  # fmt: skip
 _SENSOR_PARAMETERS = ("scale", "offset", "drift")  # the environment applies them itself
 assert set(_VARIED) | set(_SENSOR_PARAMETERS) == set(PARAMETERS)
 
@@ -58,7 +60,9 @@ class ReducedCore(TaskCore):
         batch: the machines; at least as many as variants with different parameters.
     """
 
-    def __init__(self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0) -> None:
+    def __init__(
+        self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0, device: str = "cpu"
+    ) -> None:
         """Make the machines and allocate the arrays.
 
         Args:
@@ -67,9 +71,10 @@ class ReducedCore(TaskCore):
             count: number of parallel episodes.
             threads: number of threads; 0 for one per core.
             autoreset: when an episode that ended is restarted: NEXT_STEP, SAME_STEP or DISABLED.
+            device: "cpu" or "cuda".
 
         Raises:
-            InputError: the task needs contact, or an option is not valid.
+            InputError: the task needs contact, an option is not valid, or there is no CUDA device.
         """
         stop_profiling_clock()
         check_count("num_envs", count, 1, MAX_MACHINES)
@@ -81,21 +86,23 @@ class ReducedCore(TaskCore):
             machines = machines[:1]
         rows = max(int(count), len(machines))  # the code of the mechanism is made for all variants
         self._allocate_arrays(rows, autoreset)
-        functions = make_step_functions(self.setup.task.kind)
-        self._begin, channels = functions.begin, sensor_channels(self.setup.variants.plant)
+        self.episodes["over"][count:] = 1
+        self._functions, channels = (
+            make_step_functions(self.setup.task.kind),
+            sensor_channels(self.setup.variants.plant),
+        )
         models = [reduced_model(machine, channels) for machine in machines]
         starts, *measured = make_start_states(self.setup, machines, models)
-        self._arrays = self._make_episode_arrays(machines, models, *measured)
+        arrays = self._make_episode_arrays(machines, models, *measured)
         self.batch = Batch(
-            machines, rows, period=self.setup.clock.period, timestep=options.timestep, threads=threads,
-            task=BatchTask(functions.before, functions.after, self._arrays), channels=channels, start=starts,
+            machines, rows, device=device, period=self.setup.clock.period, timestep=options.timestep, threads=threads,
+            task=BatchTask(self._functions.before, self._functions.after, arrays), channels=channels, start=starts,
         )  # fmt: skip
-        self._varied = [name for name in _VARIED if len(getattr(self._arrays, name)) > 1]
-        self.episodes["over"][count:] = 1
+        self._varied = [name for name in _VARIED if len(getattr(arrays, name)) > 1]
         self.count, self._is_started = int(count), np.zeros(count, bool)
-        for name in ("episodes", "action", "observation", "final_observation", "reward", "terminated", "truncated",
-                     "measures", "final_measures"):  # fmt: skip
-            setattr(self, name, getattr(self, name)[:count])
+        for name in _EPISODE_ARRAYS:
+            whole = getattr(self.batch.task_arrays, name)
+            setattr(self, name, whole if rows == count else whole[:count])
 
     def _make_episode_arrays(
         self, machines: list[Machine], models: list[Model], readings: np.ndarray, commands: np.ndarray
@@ -122,14 +129,8 @@ class ReducedCore(TaskCore):
             self.batch.step(None, self.setup.clock.ticks)
             return
         numbers = np.arange(self.count) if chosen is None else np.asarray(chosen, np.int64)
-        self._begin(self._arrays, self.batch.machines, numbers)
-        mask, variant = np.zeros(self.batch.count, bool), np.zeros(self.batch.count, np.int64)
-        mask[numbers], variant[numbers] = True, self.episodes["variant"][numbers]
-        self.batch.reset(mask, variant)
-        for row in range(self.batch.machines.history.shape[1]):
-            self.batch.machines.history[numbers, row] = self._arrays.start_command[variant[numbers]]
-        for name in self._varied:
-            self.batch.expand_parameters(name)[numbers] = getattr(self._arrays, name)[variant[numbers]]
+        batch = self.batch
+        self._functions.begin(batch.task_arrays, batch.model, batch.machines, np.zeros(0, np.uint64), numbers)
 
     @property
     def simulations(self) -> Any:
@@ -142,9 +143,8 @@ class ReducedCore(TaskCore):
         return sum(array.nbytes // len(array) for array in self._state_arrays().values())
 
     def _state_arrays(self) -> dict[str, np.ndarray]:
-        names = ("episodes", "observation", "final_observation", "reward", "terminated", "truncated", "measures",
-                 "final_measures")  # fmt: skip
-        found = {name: getattr(self, name) for name in names} | {"is_started": self._is_started}
+        found = {name: getattr(self, name) for name in _EPISODE_ARRAYS if name != "action"}
+        found |= {"is_started": self._is_started}
         machines = self.batch.machines._asdict()
         found |= {f"machines.{n}": a[: self.count] for n, a in machines.items() if not n.startswith("start")}
         rows = {name: self.batch.expand_parameters(name)[: self.count] for name in self._varied}

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.batch.machine_step import restart_machine
+from hydrotele.batch.machine_step import restart_history, restart_machine
 from hydrotele.core.compiled import compiled
 from hydrotele.core.device import rebuild_function
 from hydrotele.envs.episode import NEXT_STEP, SAME_STEP
@@ -191,26 +191,60 @@ def write_observation(task, i, out):
 
 
 @compiled
-def begin_chosen_episode(task, machines, chosen, n):
-    """Begin episode `chosen[n]` and write its observation; its machine is not changed.
+def begin_chosen_episode(task, model, machines, random, chosen, n):
+    """Begin episode `chosen[n]` with its machine, and write its observation.
 
     Args:
         task: EpisodeArrays.
-        machines: Machines, whose readings are written.
+        model: Model whose parameters have one row, or one per machine.
+        machines: Machines.
+        random: (k,) new states of the episodes' random generators, or (0,) to continue the present ones.
         chosen: (k,) indices of the episodes.
         n: from 0 to k - 1.
     """
-    i = chosen[n]
+    i, e = chosen[n], task.episodes[chosen[n]]
+    if len(random) > 0:
+        e.random = random[n]
     begin_episode(task, i, machines.reading[i])
+    for k in range(machines.state.shape[1]):
+        machines.state[i, k] = machines.start[e.variant, k]
+    restart_history(machines, i, e.variant)
+    shape, joint, gravity = model.mech.shape, model.mech.joint, model.mech.gravity
+    user, gain, delay, transmission = model.user, model.gain, model.delay, model.transmission
+    copy_variant(
+        task, machines, i, shape[i if len(shape) > 1 else 0], joint[i if len(joint) > 1 else 0],
+        gravity[i if len(gravity) > 1 else 0], user[i if len(user) > 1 else 0], gain[i if len(gain) > 1 else 0],
+        delay[i if len(delay) > 1 else 0], transmission[i if len(transmission) > 1 else 0],
+    )  # fmt: skip
     task.reward[i], task.terminated[i], task.truncated[i] = 0.0, 0, 0
     write_observation(task, i, task.observation[i])
 
 
 @compiled
-def begin_episodes(task, machines, chosen):
+def begin_episodes(task, model, machines, random, chosen):
     """Call `begin_chosen_episode` for all chosen episodes."""
     for n in range(len(chosen)):
-        begin_chosen_episode(task, machines, chosen, n)
+        begin_chosen_episode(task, model, machines, random, chosen, n)
+
+
+@compiled
+def copy_variant(task, machines, i, shape, joint, gravity, user, gain, delay, transmission):
+    """Copy the parameters of the variant of episode i to its machine, and the commands that hold it at the start.
+
+    The arrays after `i` are the parameters of the machine, see `batch.PARAMETERS`.
+    """
+    variant = task.episodes[i].variant
+    copy_variant_matrix(task.shape, variant, shape)
+    copy_variant_matrix(task.joint, variant, joint)
+    copy_variant_values(task.gravity, variant, gravity)
+    copy_variant_values(task.user, variant, user)
+    copy_variant_values(task.gain, variant, gain)
+    copy_variant_values(task.delay, variant, delay)
+    copy_variant_matrix(task.transmission, variant, transmission)
+    for k in range(machines.command.shape[1]):
+        machines.command[i, k] = task.start_command[variant, k]
+        for row in range(machines.history.shape[1]):
+            machines.history[i, row, k] = task.start_command[variant, k]
 
 
 @compiled
@@ -232,19 +266,11 @@ def copy_variant_matrix(table, variant, out):
 def restart_episode(task, model, sp, z, machines, i):
     """Begin a new episode with its machine, in the step of the batch; see `machine_step.after_period`."""
     begin_episode(task, i, machines.reading[i])
-    variant = task.episodes[i].variant
-    copy_variant_matrix(task.shape, variant, model.mech.shape)
-    copy_variant_matrix(task.joint, variant, model.mech.joint)
-    copy_variant_values(task.gravity, variant, model.mech.gravity)
-    copy_variant_values(task.user, variant, model.user)
-    copy_variant_values(task.gain, variant, model.gain)
-    copy_variant_values(task.delay, variant, model.delay)
-    copy_variant_matrix(task.transmission, variant, model.transmission)
-    restart_machine(model, sp, z, machines, i, variant)
-    for k in range(machines.command.shape[1]):
-        machines.command[i, k] = task.start_command[variant, k]
-        for row in range(machines.history.shape[1]):
-            machines.history[i, row, k] = task.start_command[variant, k]
+    restart_machine(model, sp, z, machines, i, task.episodes[i].variant)
+    copy_variant(
+        task, machines, i, model.mech.shape, model.mech.joint, model.mech.gravity, model.user, model.gain, model.delay,
+        model.transmission,
+    )  # fmt: skip
 
 
 @compiled

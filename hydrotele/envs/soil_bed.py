@@ -11,7 +11,7 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import arm_values
+from hydrotele.envs.episode import MAX_ARM_AXES, arm_values
 from hydrotele.kinematics.task_space import task_jacobian
 from hydrotele.soil.parameters import (
     CAT215,
@@ -176,7 +176,7 @@ def compute_bucket_edge_velocity(f, e, w, rates):
     """
     k = f.arm_axes
     jacobian = np.empty((k, k))
-    task_jacobian(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), jacobian)
+    task_jacobian(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), jacobian)
     rates[0], rates[1] = 0.0, 0.0
     for j in range(k):
         speed = w.qvel[f.dof[f.driven_axis[j]]]

@@ -202,7 +202,7 @@ class StableVecEnv(_VecEnvBase):
 
     def set_difficulty(self, difficulty: float) -> None:
         """Set the size of the goals of new episodes, see `difficulty` of `hydrotele.envs.task.Options`."""
-        self.core.parameters["difficulty"] = difficulty
+        self.core.set_difficulty(difficulty)
 
     def desynchronise(self, seed: int) -> None:
         """Let the first episodes after the next `reset` end at random times.

@@ -112,7 +112,7 @@ def draw_line_goal(f, e):
     """
     g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
     ratio = f.parameters[_SIZE_RATIO]
-    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(f.arm_axes)), start)
+    compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), start)
     for c in range(4):
         g[_START + c] = start[c]
     speed, g[_ACCELERATION] = (
@@ -281,7 +281,7 @@ def compute_true_line_errors(f, e):
     compute_line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
     along, across = compute_line_errors(e.goal, pose, r, theta, e.tip[2])
-    arm = arm_values(f, e.position, np.empty(f.arm_axes))
+    arm = arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes])
     attitude = arm[1] + arm[2] + arm[3] - pose[_ATTITUDE]
     return across, along, attitude
 

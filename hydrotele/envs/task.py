@@ -125,8 +125,9 @@ class Options:
         effects: effects added to the machine in every episode: mappings with `name`, `location`, `parameters`.
         randomise: effects with a range [low, high] for each parameter, from which every variant gets a random value;
             or the result folder of `hydrotele gap`, of whose posterior every variant is one sample; or a list of both.
-        variants: number of random machines and start positions; every episode uses one of them.
-        variant_seed: random seed of the variants.
+        variants: number of variants, which are drawn once. A variant is a start position and, with `randomise`, a
+            random machine. The seed of `reset` selects one for each episode.
+        variant_seed: random seed of the variants; another value gives other variants.
         timestep: physics step [s].
         servo: settings of the joint servo that differ from those of the task, as in scenarios, such as
             `{"axis_gains": {"swing": 1.0}}` for the heavy upper structure of another machine.
@@ -273,7 +274,7 @@ def compute_path_effort(f, start, change):
     Source: `kinematics.task_space`.
     """
     k = f.arm_axes
-    pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(k), np.empty(k)
+    pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)[:k], np.empty(MAX_ARM_AXES)[:k]
     worst = 0.0
     for n in range(_PATH_SEGMENTS + 1):
         for c in range(MAX_ARM_AXES):
@@ -307,7 +308,7 @@ def compute_measured_pose(f, e, pose):
 
     Source: `kinematics.task_space.compute_tip_pose`.
     """
-    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(f.arm_axes)), pose)
+    compute_tip_pose(f.arm, arm_values(f, e.joint, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
 
 
 RECOVERY_SPEED = 0.5  # m/s, speed at which potentials assume that an error decreases

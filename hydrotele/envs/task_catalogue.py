@@ -78,7 +78,8 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
 
     Args:
         task: name of the task, or another argument of `find_task`.
-        choices: fields of `envs.task.Options`, and `device`: None for MuJoCo, "cpu" for the reduced model.
+        choices: fields of `envs.task.Options`, and `device`: None for MuJoCo, "cpu" or "cuda" for the
+            reduced model.
         count: number of environments.
         threads: number of threads that step the environments, 0 for one per core.
         autoreset: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
@@ -90,8 +91,8 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
         InputError: the task or an option does not exist, or a value is not valid.
     """
     found, choices = find_task(task), dict(choices)
-    if (device := choices.pop("device", None)) not in (None, "cpu"):
-        raise InputError("environment option 'device'", f"must be cpu, for the reduced model, not {device!r}")
+    if (device := choices.pop("device", None)) not in (None, "cpu", "cuda"):
+        raise InputError("environment option 'device'", f"must be cpu or cuda, for the reduced model, not {device!r}")
     known = {field.name for field in dataclasses.fields(Options)}
     if strange := set(choices) - known:
         name = sorted(strange)[0]
@@ -100,7 +101,11 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
     if device is not None:
         from hydrotele.envs.reduced_core import ReducedCore  # loads the tracing of mechanisms
 
-        return ReducedCore(found, options, count, threads, autoreset)
+        if device == "cpu":
+            return ReducedCore(found, options, count, threads, autoreset)
+        from hydrotele.envs.device_core import DeviceCore
+
+        return DeviceCore(found, options, count, threads, autoreset)
     step_or_reset_simulation.compile_in_background(
         _COMPILE_LOOPS_COMMAND
     )  # while the plant's own code is compiled here

@@ -164,7 +164,7 @@ def compute_track_error(f, e):
     `f` and `e` are records of TASK_PARAMETERS and EPISODE_STATE. The kinematics are the nominal ones.
     """
     now = e.tick * f.period
-    q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
+    q, pose = np.empty(MAX_ARM_AXES)[: f.arm_axes], np.empty(MAX_ARM_AXES)
     for a in range(f.arm_axes):
         q[a] = compute_axis_reference(e.goal, f.driven_axis[a], now)[0]
     compute_tip_pose(f.arm, q, pose)

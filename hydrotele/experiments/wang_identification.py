@@ -176,7 +176,7 @@ def _make_estimate_description(names: tuple[str, ...]):
         parts = [f"{name} assumed {first[f'assumed {name}']:.2f}, identified"
                  f" {first[f'mean {name}']:.2f} ± {first[f'deviation {name}']:.2f}"
                  for name in names]  # fmt: skip
-        return f"{'; '.join(parts)} (mm or mrad, first robot)"
+        return f"with sensor noise, posterior mean ± standard deviation: {'; '.join(parts)} (mm or mrad, first robot)"
 
     return describe_estimates
 
@@ -298,10 +298,11 @@ def _evaluate_independent_parameters(samples: Sequence[Sample]) -> Evaluation:
                     "the refined model has 36, and must be minimal (p. 24)",
                     published=36.0),),
         f"Four parameters are redundant: theta4, d4, a4 and alpha4 have the same effect as a"
-        f" common displacement of A1 to A6. Only without tilt of the platform A_i and B_i"
-        f" cannot be distinguished; then the rank is {format_count('rank dh without tilt')} (D-H) or"
-        f" {format_count('rank poe without tilt')} (POE). 36 parameters cannot describe a robot with"
-        f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)}"
+        f" common displacement of A1 to A6. Without tilt of the platform, errors of A_i and B_i cannot be"
+        f" distinguished. The number then falls by the 18 coordinates of A1 to A6, to"
+        f" {format_count('rank dh without tilt')} (D-H) or {format_count('rank poe without tilt')} (POE)."
+        f" 36 parameters cannot describe a robot with errors in all 54: RMS position error"
+        f" {format_values(samples, 'error with 36', 1e3, 2)}"
         f" mm at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
         " independent ones.",
         f"{format_count('told')} are determined to better than 0.5 mm or 0.5 mrad with this noise; the 36"

@@ -529,7 +529,8 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     make_deterministic_experiment("damping of the master", measure_stability_without_damping, make_claim(
         "rate control: damping of the master",
         '"otherwise, the system can not be stable" (B_mc = 0 in 3.72)', "p. 48",
-        evaluate_stability_without_damping, {"damping": 200.0}, "a damped master",
+        evaluate_stability_without_damping, {"damping": 200.0},
+        "the masters have damping, although the names of the quantities say \"without damping\"",
     )),
     Experiment("task identification", measure_task_identification, (make_claim(
         "transparency via impedance identification",

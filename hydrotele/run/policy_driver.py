@@ -12,6 +12,7 @@ from hydrotele.control.action_limits import MAX_ACCELERATION, MAX_POSE_ACCELERAT
 from hydrotele.control.arm_kinematics import COORDINATES, arm_specification
 from hydrotele.control.plan import Plan
 from hydrotele.control.rate_references import ArmLimits, advance_joint_reference, advance_pose_reference
+from hydrotele.control.resolved_motion import POSE_SIZE
 from hydrotele.control.servo import DriveReferences, interpolate_drive_reference, tabulate_drive_geometry
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.task_space import compute_tip_pose
@@ -21,7 +22,6 @@ from hydrotele.scenario.pilots import PolicyPilot
 from hydrotele.scenario.scenario import Servo
 from hydrotele.simulate.sensor_models import Feedback
 
-_POSE_SIZE = 5
 _PREVIEW = re.compile(r"reference_in_(\d+)_ms")
 
 
@@ -83,7 +83,7 @@ class PolicyDriver:
             numbers, names, arm_ranges = arm_specification(machine)
             self._arm = ArmLimits(numbers, arm_ranges, np.array(MAX_POSE_ACCELERATIONS))
             self._arm_columns = np.array([axes.index(name) for name in names])
-        self._pose_speed = np.zeros(_POSE_SIZE)
+        self._pose_speed = np.zeros(POSE_SIZE)
         self._pose_speed[: len(self._arm_columns)] = pilot.pose_rates[: len(self._arm_columns)]
         self._goal = plan.reference[:1].copy() if plan.goal is None else plan.goal
         self._goal_rate = np.zeros_like(self._goal) if plan.goal_rate is None else plan.goal_rate
@@ -128,11 +128,11 @@ class PolicyDriver:
         self._loop.plan.command[:] = self._loop.initial_commands
         self._reference = self._loop.readings.joint.copy()
         self._rate = np.zeros_like(self._reference)
-        self._pose, self._pose_rate = self._tip_pose(self._reference), np.zeros(_POSE_SIZE)
+        self._pose, self._pose_rate = self._tip_pose(self._reference), np.zeros(POSE_SIZE)
 
     def _tip_pose(self, position: np.ndarray) -> np.ndarray:
         """Return the pose (5,) of the tip at positions of all axes; 0 without an arm."""
-        pose = np.zeros(_POSE_SIZE)
+        pose = np.zeros(POSE_SIZE)
         if self._arm:
             compute_tip_pose(self._arm.parameters, position[self._arm_columns], pose)
         return pose
@@ -141,7 +141,7 @@ class PolicyDriver:
         joint, period, first = self._loop.readings.joint, 1.0 / self._loop.control_rate, 0
         if self._pilot.action == "resolved_motion":
             assert self._arm
-            first, goal = len(self._arm_columns), np.zeros(_POSE_SIZE)
+            first, goal = len(self._arm_columns), np.zeros(POSE_SIZE)
             goal[:first] = self._action[:first] * self._pose_speed[:first]
             q, rates = self._reference[self._arm_columns], self._rate[self._arm_columns]
             advance_pose_reference(

@@ -41,13 +41,15 @@ def main() -> None:
 def _ways(name: str, asked) -> list[str]:
     lines = [
         "Physics steps of 1 ms per second of time, larger is better. Each row is one control rate; at a "
-        f"lower rate, more physics steps follow from one call. The batch has {asked.batch} environments, "
+        f"lower rate, one call makes more physics steps, so the time that `Sync` needs for each call matters less. "
+        f"The batch has {asked.batch} environments, "
         f"`Sync` {asked.loop}, `Async` {asked.processes}. `Physics alone` is MuJoCo's `mujoco.batch.Batch` "
-        "with two threads on the same model and commands, without control, sensors and reward: about what is "
-        "possible at most. The batched environments have their own loop over `mj_step` and may be faster. "
+        "with two threads on the same model and commands, without control, sensors and reward: a reference for "
+        "the simulation alone. It is no upper limit: the batched environments do not use this class, and their "
+        "loop over `mj_step` may be faster. "
         "The last three columns are ratios; above 1 the first is faster.",
         "",
-        "| control rate [Hz] | physics steps per step | batched, 2 threads | 1 thread | Sync "
+        "| control rate [Hz] | physics steps per call | batched, 2 threads | 1 thread | Sync "
         "| Async | physics alone | batched / Sync | batched / Async | physics alone / Sync |",
         "| " + " | ".join(["---"] * 10) + " |",
     ]

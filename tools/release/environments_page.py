@@ -34,8 +34,9 @@ and on any number of threads. Environment i of a batch has the seed of the first
 `env.unwrapped.get_state()` returns the complete state, and `set_state(state)` continues from it with bit-identical
 results.
 
-**Variants**: an environment draws `variants` random machines and start positions when it is made. Every episode uses
-one of them; `env.unwrapped.core.setup.variants` lists them.
+**Variants**: when an environment is made, it draws `variants` start positions, each with its own machine. The machines
+differ only with the option `randomise`. Every episode uses one variant, which the seed of `reset` selects;
+`env.unwrapped.core.setup.variants` lists them.
 
 **Info**: the dictionary `info` has true values of the task, listed for each task, and `variant`, the number of the
 variant.

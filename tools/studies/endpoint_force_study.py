@@ -353,7 +353,8 @@ def contact(results: list[dict]) -> list[str]:
         "## Contact with the ground", "",
         "How large is the error while the bucket touches the ground? The bucket is lowered, pressed on the "
         "ground, held, then dragged towards the machine and lifted. Each row is one part of this motion. "
-        "True force: RMS of the simulator's contact force. The next two columns are the RMS error of the "
+        "True force: RMS of the simulator's contact force. It differs between ideal and real sensors, because "
+        "the controller of the motion uses the sensors. The next two columns are the RMS error of the "
         "estimate against it. Most of it is the delay of the filters. The last two columns compare with the "
         "true force passed through the same filters: this is the error of the estimator itself.",
         "",

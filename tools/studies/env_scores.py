@@ -37,11 +37,15 @@ Each table is one task. A row is one combination of:
 - controller. All controllers run the same episodes (same seeds and machines). The reference knows the nominal
   machine and the observation only.
 
-Cells are mean ± standard error over the episodes, with the unit in brackets ([1] has no unit):
+Cells are mean ± standard error over the episodes, with the unit in brackets ([1] has no unit). A standard error
+of 1e-16 is a rounding error: all episodes have the same value.
 
 - return: sum of rewards, larger is better; `success`: fraction of successful episodes, larger is better;
-- a name with RMS: root mean square over an episode. It is an error where the name says error or distance
-  (smaller is better), otherwise a description of the episode, such as `soil` (0 soft, 1 loamy, 2 firm);
+- a name with RMS: root mean square over an episode. Where the name says error or distance, it includes the way
+  to the goal and is not the final error. In tasks with `success`, success ends the episode. A successful
+  episode is then shorter, and its RMS may be larger than that of a failed one that stays near the goal. Compare
+  `success` and return there; in the other tasks a smaller error is better. Other names describe the episode, such
+  as `soil` (0 soft, 1 loamy, 2 firm);
 - a name with `final`: fraction of episodes in which the condition holds at the end. `contact` is good;
   `overload`, `off_plate` (the tip has left the plate) and `spoiled` (the bucket went too far below the target
   plane) are failures; `held` is 1 if the log is still in the grapple.
@@ -57,8 +61,8 @@ TASK_LINES = {
     "angle.",
     "HoldForce": "The bucket presses on a plate with a given force of 10 to 35 kN. `force_error`: difference from it; "
     "`contact`: the bucket touches the plate; `overload`: more than 100 kN.",
-    "ReachFeller": "A feller-buncher moves its head to a pose. `distance` and `attitude_error`: remaining distance and "
-    "angle.",
+    "ReachFeller": "A feller-buncher moves its head to a pose. `distance` and `attitude_error`: distance and angle "
+    "from the pose.",
     "Grade": "A bucket cuts a low bank of soil down to a plane. `profile_rms`: error of the profile; "
     "`carried_mass`: soil in the bucket; `soil_force`: force of the soil.",
     "PlaceLog": "A grapple picks up a log and lays it down at a goal. `log_distance` and `yaw_error`: from log to "

@@ -105,13 +105,13 @@ def main() -> None:
         f"design varies the amplitudes and phases of {asked.harmonics} harmonics and keeps the limits of "
         f"joint range, stroke, flow and pressure; it starts from {asked.starts} random motions. It maximises the "
         "determinant of the information matrix, that is, it minimises the volume of the joint confidence "
-        f"region (D-optimal design). The criterion counts {len(base)} [base parameters](../terms.md): those "
+        f"region (D-optimal design). The determinant is that of {len(base)} [base parameters](../terms.md): those "
         "that a random motion determines despite the sensor noise. More are determined by logs without noise "
         "([identifiability](identifiability.md)).",
         "",
         "| quantity | value |", "| --- | ---: |",
-        f"| information per parameter, designed motion relative to `{OLD}` (root of the determinants' ratio) |"
-        f" {better:.1f} |",
+        f"| predicted information, designed motion over `{OLD}`: root of order {len(base)} of the ratio of "
+        f"the determinants | {better:.1f} |",
         "| largest use of a limit (joint range, stroke, flow, pressure) by the designed motion |"
         f" {100 * new.max_utilisation:.0f} % |",
         f"| parameters determined by both motions | {len(both)} |",
@@ -120,7 +120,9 @@ def main() -> None:
         f"| standard deviation of a parameter, `{OLD}` over designed motion, median | "
         f"{np.median(list(ratios.values())):.2f} |", "",
         "The first two rows describe the design: information above 1 favours the designed motion, and the "
-        "use of a limit must not exceed 100 %. In the last row, a value above 1 favours the designed motion.",
+        "use of a limit must not exceed 100 %. Information is an inverse variance, so its square root compares "
+        "with a ratio of standard deviations. The other rows come from the simulated logs. In the last row, a value "
+        "above 1 favours the designed motion.",
         "",
         "A parameter is a mass property or a friction coefficient of a link or drive, in SI units. "
         "`boom_rod` and `stick_rod` are the cylinders of boom and stick. `inertia_xy` is an element of the "

@@ -16,6 +16,8 @@ from pathlib import Path
 from hydrotele.cli.experiments_command import write_comparison_files
 from hydrotele.experiments.comparison import Series, compare_by_repetition_count
 
+_MARKS = {"input": " (input)", "additional": " (not in the publication)", "caption": " (caption only)"}
+
 
 def import_series(name: str) -> Series:
     """Return the series of a document, such as `zhu1994`."""
@@ -51,7 +53,7 @@ def main() -> None:
     changed = []
     for rows in zip(*(found[count] for count in counts), strict=True):
         verdicts = [row.verdict for row in rows]
-        lines.append(f"| {rows[0].name} | " + " | ".join(verdicts) + " |")
+        lines.append(f"| {rows[0].name}{_MARKS.get(rows[0].kind, '')} | " + " | ".join(verdicts) + " |")
         if {"agrees", "differs"} <= set(verdicts):
             changed.append(rows[0].name)
     lines += ["", f"{len(changed)} rows change between agrees and differs.", ""]

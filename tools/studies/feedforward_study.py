@@ -171,8 +171,9 @@ def main() -> None:
             "",
             "Swing, boom and stick of the CAT 215 with a force drive on each joint (no hydraulics) follow a "
             "circle and a square. The simulated machine differs in masses and friction from the given model. "
-            "The identified model was fitted to a log of the same machine; the exact model has the true "
-            "parameters.",
+            "The feedback is proportional, without integral action, so that without a model gravity deflects "
+            "the arm by 0.7 m at the tip. The identified model was fitted to a log of the same machine; the "
+            "exact model has the true parameters, so its column is the limit of this controller.",
             "",
             "Cells are RMS distances of the tip from its reference after the start in mm; smaller is better. "
             "Lap: time for one round; a shorter lap is faster.",

@@ -23,12 +23,12 @@ def report() -> str:
         "compares the counts with Table 13 of Khoshzaban 1992. With the assumptions of the thesis the counts "
         "are equal. With real pins at the cylinder ends, six fewer combinations can be identified.",
         "",
-        "A parameter is fully identifiable if its value can be computed. It is linearly identifiable if only "
-        "a sum with other parameters can be computed. It is unidentifiable if it has no effect or only "
-        "repeats the effect of others. The regressor, the matrix that relates the parameters to the drive "
-        "forces, is evaluated in 300 independent random states of motion. Its rank is the number of [base "
-        "parameters](../terms.md), the independent combinations that can be identified. Unidentifiable is 82 "
-        "minus the rank (thesis, p. 100). The last column gives the singular values of the regressor before "
+        "The regressor, the matrix that relates the parameters to the drive forces, is evaluated in 300 "
+        "independent random states of motion. Its rank is the number of [base parameters](../terms.md), the "
+        "independent combinations that can be identified. A base parameter that is a single parameter is "
+        "fully identifiable. A base parameter that is a sum of several counts as one linearly identifiable "
+        "parameter. The others, 82 minus the rank, count as unidentifiable (thesis, p. 100): they have no "
+        "effect, or appear only in these sums. The last column gives the singular values of the regressor before "
         "and after the rank, relative to the largest one, with columns scaled to length 1. A large step "
         "between them means that the rank is certain.",
         "",
@@ -55,8 +55,8 @@ TEXT = """\
 - Pins transmit the moment that rotates tubes and rods about the cylinder axes during swing motion.
   Six combinations that Eq. 4.23 separates are then not separable from the inertias of the links.
 - In practice the difference is small: the models differ by the inertia of tubes and rods about their
-  axes, 10 kg m^2 each in Table 13. This is 0.05 % of the swing torque in the simulated motions of the
-  thesis, and zero in the cylinder forces.
+  axes, 10 kg m^2 each in Table 13. In the simulated motions of the thesis it changes the swing torque by
+  0.05 % and the cylinder forces not at all.
 - Nine of the ten inertial parameters of the swing (all except Izz) have no effect in both models.
 - The regressor with pins agrees with the inverse dynamics of MuJoCo to 1e-8. For both assumptions
   it agrees with the recursion of the thesis (Eqs 4.20 to 4.47), derived independently in

@@ -118,7 +118,8 @@ def report(trials: Sequence[list[Errors]], measured: Sequence[Errors]) -> str:
         *rows(measured), "",
         "Published for the real excavator of Khoshzaban 1992, as a comparison of magnitude. It is another "
         "machine with other sensor noise, and its forces were not low-pass filtered; the tables above "
-        "compare forces below the frequency at which position noise dominates. `nominal` is its model before "
+        "compare low-pass filtered forces. `identify` chooses the cutoff frequency from the logs; above it, position "
+        "noise dominates. `nominal` is its model before "
         "identification.",
         "",
         "| force of | complete | reduced | nominal |", "| --- | ---: | ---: | ---: |",

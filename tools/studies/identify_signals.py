@@ -94,7 +94,7 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
     return out
 
 
-def report(results: list[dict[str, list[list[float]]]]) -> str:
+def report(results: list[dict[str, list[list[float]]]], cycles: int) -> str:
     """A table in Markdown."""
     lines = [
         "Identification needs velocities and accelerations, but sensors measure noisy positions only. This "
@@ -102,11 +102,13 @@ def report(results: list[dict[str, list[list[float]]]]) -> str:
         "Filtering in the frequency domain or with a zero-phase filter (without delay) is best; plain "
         "differences are 5 to 13 times worse at this task.",
         "",
-        f"Each model predicts the forces along a circle of {RADIUS:g} m radius; a shorter lap is faster. "
-        f"Cells are RMS errors over one lap, mean of {len(results)} trials; smaller is better. The last "
-        "column combines the drives: the geometric mean of the error relative to the smallest error of that "
-        "lap; 1 is best. \"Bias subtracted\": the bias that noise causes is estimated by adding noise once "
-        "more, and subtracted.",
+        f"The machine, a simulated CAT 215, repeats a motion of {PERIOD:g} s {cycles} times. A model is fitted to "
+        "each log with sensor noise, and predicts the forces along another path, a circle of "
+        f"{RADIUS:g} m radius; a shorter lap is faster. Cells are RMS errors over one lap, mean of "
+        f"{len(results)} trials; smaller is better. The last column combines the drives: the geometric mean of "
+        "the error relative to the smallest error of that lap; 1 is best. \"Bias subtracted\": noise of the "
+        "positions causes a bias of the identified parameters; it is estimated by adding noise once more, and "
+        "subtracted.",
         "",
         "| lap [s] | processing | swing [N m] | boom [N] | stick [N] | all, relative to best |",
         "| ---: | --- | ---: | ---: | ---: | ---: |",
@@ -125,4 +127,4 @@ def report(results: list[dict[str, list[list[float]]]]) -> str:
 if __name__ == "__main__":
     asked = options(__doc__, trials=10, seed=1, cycles=5, jobs=2)
     found = side_by_side(one_trial, asked, asked.cycles)
-    publish(report(found), "Signal processing for identification", asked)
+    publish(report(found, asked.cycles), "Signal processing for identification", asked)

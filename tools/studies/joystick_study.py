@@ -333,8 +333,8 @@ def damping() -> list[str]:
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for name, (stiff, turn, about, rub) in printed.items():
-        for damped, what in ((rub, "printed"), (rub / 2, "half"), (rub / 100, "unit 1"),
-                             (0.25, "chosen")):  # fmt: skip
+        for damped, what in ((rub, "printed"), (rub / 2, "half of the printed value"),
+                             (rub / 100, "printed value without the factor 100"), (0.25, "chosen")):  # fmt: skip
             for rate in (200.0, 1000.0):
                 springs, dampers = np.array([stiff, turn]), np.array([60.0, damped])
                 decays = [
@@ -355,10 +355,13 @@ def damping() -> list[str]:
     fast = [min_stable_handle_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
     return [
         *lines, "",
-        "The second column tests three readings of the printed value, and the chosen one. Half: the damper acts "
-        "on the rate of the Euler vector of 5.1.3, which is half of the rate of the angle. Unit 1: the unit of "
-        "damping is 1 and not 100 N m/rad/s. Chosen: the value of this project (A), stable at 200 Hz in rz and "
-        "with a hand.",
+        "The second column has three interpretations of the printed value, and the value that hydrotele uses:",
+        "",
+        "- printed: as printed, in units of 100 N m/rad/s.",
+        "- half of the printed value: if the damper acts on the rate of the Euler vector of 5.1.3, which is half of "
+        "the rate of the angle.",
+        "- printed value without the factor 100: if the unit of damping is 1 N m/rad/s.",
+        "- chosen: the value of this project (A), stable at 200 Hz in rz and with a hand.",
         "",
         f"To be stable at 200 Hz, the printed damping of rz requires moments of inertia of {1e3 * needed[0]:.1f} "
         f"and {1e3 * needed[1]:.1f} g m^2 (excavator, feller-buncher). These are radii of gyration of"
@@ -543,9 +546,10 @@ def report(results) -> str:
         "- Identification includes no error of the coil map and none of the position of the "
         "diodes; a real joystick has both.",
         "- "
-        "No flotor of this size makes the printed rotational damping stable at 200 Hz. Either the printed unit "
-        "of damping is not that of stiffness, or the coil loop of the real joystick ran faster than the 200 Hz "
-        "of 5.3.",
+        "No flotor of this size makes the printed rotational damping stable at 200 Hz. Either the factor 100 holds "
+        "for the printed stiffness but not for the damping, or the coil loop of the real joystick ran faster than "
+        "the 200 Hz of 5.3. At 1 kHz, x and ry are stable with the printed damping and a hand, but not without a "
+        "hand.",
         "- "
         "Without a hand, x and ry are unstable at 200 Hz with all of these dampings, because a push at the "
         "handle tilts a free flotor. A handle without a hand is therefore held by the law of 5.1.3. It controls "

@@ -42,10 +42,12 @@ INTRODUCTION = (
     "How well conditioned is the geometry of the hexapod PaLiDA (a platform on six telescopic legs), and can "
     "its pose be computed from leg lengths? This study gives the condition number of its Jacobian, the "
     "number of poses with equal leg lengths, and the computing time of its regressor.\n\n"
-    "The inverse Jacobian relates platform to leg velocities. A large condition number means a singularity, "
-    "where legs cannot hold the platform; rotations are multiplied by the radius of the platform's joints, "
-    f"{1e3 * RADIUS:g} mm. In [the map](palida_workspace.png) light is good and dark is singular; the white "
-    "line is the workspace that leg strokes and hinges allow."
+    "The inverse Jacobian relates platform to leg velocities. A large condition number means that the pose is near a "
+    "singularity, where legs cannot hold the platform. Rotations are multiplied by the radius of the platform's "
+    f"joints, {1e3 * RADIUS:g} mm, so that they have the unit of translations. [The map](palida_workspace.png) has "
+    "three cuts through the home pose; in each, two coordinates vary and the others are those of the home pose. Light "
+    "is good and dark is singular (rotations by 90 deg about z). The white line is the workspace that leg strokes and "
+    "hinges allow; it contains the singular poses, too."
 )
 
 

@@ -133,15 +133,18 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
         "friction of the drives; reduced: without the masses of cylinder tubes and rods. `true motion` is "
         "the exact motion of the simulator, so that only pressures have errors. The columns 25 psi, 5 psi "
         f"and no error are RMS errors over {len(results)} trials relative to the size of the parameter "
-        "(geometric mean over the parameters); smaller is better. The last two columns say how many times "
-        "smaller the error becomes.",
+        "(geometric mean over the parameters); smaller is better. For the last two columns the ratio of two "
+        "errors is computed for every parameter; they give the median of these ratios and, in parentheses, "
+        "the smallest and the largest. They are therefore not the ratios of the columns before. The errors of "
+        "the angles are drawn anew for every column, so without pressure error the result may by chance be "
+        "slightly worse than with 5 psi.",
         "",
         "Errors above 100 % occur because every [base parameter](../terms.md) is estimated, even if noise "
         "leaves it undetermined, as in the thesis. [Other studies](identifiability.md) also count the "
         "friction of joints and pins.",
         "",
-        "| model | positions | 25 psi | 5 psi | no error | ratio 25 psi to 5 psi: median (range) |"
-        " ratio 25 psi to no error: median |",
+        "| model | positions | 25 psi | 5 psi | no error | error with 25 psi over 5 psi: median (smallest to largest) |"
+        " error with 25 psi over no error: median |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for model in ("complete", "reduced"):

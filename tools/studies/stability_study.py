@@ -285,14 +285,15 @@ def main() -> None:
         "| stable | fraction of the cases that are stable in simulation; neither high nor low is "
         "better |",
         "| close to the limit | fraction of the cases in which a change of the factor by "
-        f"{100 * NEAR:g} % changes the prediction |",
+        f"{100 * NEAR:g} % changes the prediction. This range is narrower than that of the section "
+        "*Factor near the predicted limit* |",
         "| correct, close to the limit; correct, others | correct predictions of these cases and "
         "of all other cases |",
         "",
         "No case is excluded.",
         "", "## All cases", "", *table(found),
         "", "## Random factor", "", *table(plain),
-        "", "## Factor close to the predicted limit", "", *table(aimed),
+        "", "## Factor near the predicted limit", "", *table(aimed),
         "", "## Wrong predictions", "",
         "The next table lists all wrong predictions by the criterion on which the prediction was "
         "based:",
@@ -333,8 +334,9 @@ def main() -> None:
         "",
         '"-": not defined for this nonlinear structure.',
         "", *robust_table(), "",
-        "The same at 1 kHz. Only the stability columns can change: master alone, Llewellyn and "
-        "Z-width are computed in continuous time. `wave_variables` is now stable with the handle "
+        "The same at 1 kHz. The columns *master alone*, *Llewellyn* and *Z-width* are computed in "
+        "continuous time and do not depend on the rate; only the other columns can change. "
+        "`wave_variables` is now stable with the handle "
         "released:",
         "", *robust_table(0.001),
         "", "## Stiffness feedback with the published gains (Zhu 1994, Tables 6.7 and 6.9)", "",

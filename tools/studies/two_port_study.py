@@ -95,8 +95,9 @@ def main() -> None:
         "",
         "Each row is one control structure. In `position_position` (coordinating force) positions are sent "
         "both ways. In `position_force` (direct force) a position is sent to the slave and a force back. "
-        "Four-channel structures send motion and force both ways. `rate_` structures and `four_channel_rate` "
-        "are the same under rate control. Columns:",
+        "`four_channel_position` sends motion and force both ways. `rate_position`, `rate_force` and "
+        "`four_channel_rate` are the same three structures under rate control, where the deflection of the "
+        "handle sets the velocity of the slave. Columns:",
         "",
         "- impedance error: largest error of the formula against a simulation in which the handle is moved "
         "by sines of 0.1 to 5 Hz; smaller is better;",
@@ -110,7 +111,8 @@ def main() -> None:
         "Every mass, damper, spring and gain of the shipped case is multiplied by 10^u, with u uniform "
         f"between {-SPREAD} and {SPREAD}. `agree`: cells in which formula and simulation agree; worst case: "
         "the lowest value of a single random case. Sweeps: simulations that measure the impedance, without "
-        f"delay and with one of up to {1e3 * SWEPT:g} ms; the last three columns give their errors.",
+        f"delay and with one of up to {1e3 * SWEPT:g} ms. `over 3 %` is the number of sweeps with a larger "
+        "impedance error than 3 %; the last two columns give the median and the largest error.",
         "", *drawn, "", "## Limits", "",
         "- A sweep is not measurable if the slave is unstable while the handle is held, because the motion then "
         "never settles.",

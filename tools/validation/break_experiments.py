@@ -77,11 +77,11 @@ def format_introduction(name: str, count: int, failures: int) -> list[str]:
         " does not affect the verdict.",
         "- Range that agrees: accepted values of each quantity; the comparison gives the reasons. \"Outside\" lists the"
         " quantities whose intervals are completely outside their",
-        "  range; \"partly outside\" those whose intervals are partly inside.",
+        "  range; \"partly outside\" those whose intervals are partly inside and partly outside.",
         "- Verdict: *differs* if at least one quantity is outside, or is not a finite number (`inf`, `nan`).",
         "- A row may differ in the comparison, too. Its fault then shows only that the fault does not make it agree.",
-        "- The name of a quantity describes the simulation without the fault. The fault is present also where the"
-        " name states the opposite.",
+        "- Names of quantities are those of the comparison, where there is no fault. A name may therefore contradict"
+        " the fault; what was simulated is what the column \"fault\" says.",
         "- `inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
         " not exist in a repetition, or has no definition, because",
         "  the repetitions have no scatter.",

@@ -164,8 +164,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--method", choices=("search", "regression"), default="regression", help="of these gap runs")
     chosen = parser.parse_args(arguments)
     nominal, total, rows = load_machine("cat215", "bucket"), None, []
-    print("| seed | contact [s] | found [%] | found above 1 kN [%] | free [s] | found as contact [%]"
-          " | with load [s] | found [%] | without load, found as load [%] |")  # fmt: skip
+    print("| seed | contact [s] | contact found [%] | contact above 1 kN found [%] | free [s]"
+          " | free taken for contact [%] | loaded [s] | loaded found [%] | empty taken for loaded [%] |")  # fmt: skip
     print("| --- " + "| ---: " * 8 + "|")
     for seed in chosen.seeds:
         log, truth = simulate(seed, draw_machine(seed, nominal), f"dig_{seed}")

@@ -88,10 +88,11 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
         f"Gap finding must not name an effect if nothing is hidden. {len(noted)} simulated unchanged machines are"
         " searched; motions and sensors are those of the [blind validation](blind_trials/summary.md).",
         "",
-        "- score of the best effect: how much the best effect improves twice the log [evidence](../terms.md), less a"
+        "- score of the best effect: increase of 2 log [evidence](../terms.md) by the best effect, minus a"
         f" penalty for its parameters. An effect is added to the model only above {ENTER:g}.",
-        "- worst channel: the largest value over all channels of each [residual test](../gap.md#residual-tests) of the"
-        " prediction errors. A test fails only above its threshold.",
+        "- worst channel: the largest value over all channels of a [residual test](../gap.md#residual-tests) of the"
+        " prediction errors: their mean square, the mean square of their means over 1 s, and their autocorrelation."
+        " A test fails only above its threshold.",
         "",
         "Columns: the value that this fraction of the machines does not exceed. All must be below the threshold.",
         "",

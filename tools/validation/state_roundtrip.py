@@ -29,7 +29,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=1000, help="environment steps that are compared")
     steps = parser.parse_args().steps
-    print("| task | environments | state [bytes] | steps | ends of episodes | values compared | different |")
+    print("| task | environments | state of one environment [bytes] | steps | ends of episodes | values compared"
+          " | different |")  # fmt: skip
     print("| --- | --- | --- | --- | --- | --- | --- |")
     failed = 0
     for name in hydrotele.envs.TASK_NAMES:

@@ -209,10 +209,11 @@ def print_table(measured: dict, driver: Recorder, pacer: Pacer):
     rows = {"key to input": to_input, "key to valve": to_valve}
     for name, values in rows.items():
         print_row(f"{name}, {len(values)} presses", 1e3 * np.array(values))
-    print_row("round trip that the page displays", np.array(measured["round trips"]))
-    print(f"\npose messages: {measured['poses']:.1f} per second")
+    name = "round trip that the page displays: from sending an input to processing the answer in the page"
+    print_row(name, np.array(measured["round trips"]))
+    print(f"\nmachine poses that the server sends: {measured['poses']:.1f} per second")
     if "frames" in measured:
-        print(f"drawn frames: {measured['frames']:.1f} per second")
+        print(f"frames that the browser draws: {measured['frames']:.1f} per second")
     print(f"processor time of simulation, server and two pages: {measured['processor']:.2f} s per second")
     print(f"pauses: {pacer.pauses}, {pacer.total_delay:.2f} s")
 
