@@ -148,8 +148,12 @@ class Check(NamedTuple):
         return f"{words} {self.unit}" if self.unit else words
 
 
+_MIN_SCIENTIFIC_VALUE = 1e7  # values from here on are printed with an exponent
+
+
 def _format_value(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1e3 or np.isinf(value) else f"{value:.0f}"
+    is_rounded = abs(value) < 1e3 or abs(value) >= _MIN_SCIENTIFIC_VALUE
+    return f"{value:.3g}" if is_rounded else f"{value:.0f}"
 
 
 def _list_numbers(numbers: Sequence[int]) -> str:
@@ -563,5 +567,8 @@ def summarize_verdicts(rows: Sequence[Comparison]) -> str:
     if captions:
         text += f"; {captions} published by caption only"
     if additional:
-        text += f"; {additional.count('agrees')} of {len(additional)} additional statements hold"
+        text += (
+            f"; of {len(additional)} statements that are not in the publication {additional.count('agrees')} agree,"
+            f" {additional.count('differs')} differ, {additional.count('undecided')} undecided"
+        )
     return text

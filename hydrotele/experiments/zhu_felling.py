@@ -122,7 +122,8 @@ def _evaluate_contact(samples: Sequence[Sample]) -> Evaluation:
     )
     explanation = (
         "the resting disc touches the stem, then the operator retracts it and starts the saw,"
-        " because a disc that presses on the stem does not start"
+        " because a disc that presses on the stem does not start; without contact, times are inf and forces nan,"
+        " and one such operator makes the mean inf or nan"
     )
     return Evaluation(checks, explanation, note)
 
@@ -140,7 +141,7 @@ def _evaluate_felt_stiffness(samples: Sequence[Sample]) -> Evaluation:
     )
     explanation = (
         f"felt: a change of more than {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} %, the just noticeable difference"
-        " of a compliance (Tan 1995)"
+        " of a compliance (Tan 1995); without contact, stiffness and force are nan"
     )
     return Evaluation((check,), explanation, note)
 

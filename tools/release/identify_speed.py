@@ -103,7 +103,7 @@ def throughput(rows: int) -> list[tuple[str, float]]:
         ("loop closure, accelerations, inertial columns of all bodies, projected on the drives",
          (middle - started) * per),
         ("the same with friction and offsets", ours * per),
-        ("Pinocchio tree regressor in a Python loop, with loops already closed", loop * per),
+        ("Pinocchio, called row by row from Python: inertial columns for a given motion of all joints", loop * per),
     ]  # fmt: skip
 
 
@@ -127,8 +127,8 @@ def main() -> None:
         "",
         "A main step builds the regressor, the matrix that relates parameters to forces. The next table "
         "compares its time per row of the log with Pinocchio, a library for robot dynamics. Pinocchio's row "
-        "does less work: it has the columns of the tree without closed loops, without projection on the "
-        "drives and without friction.",
+        "does less work: it receives the motion of all joints, so that it closes no loops, and it has neither "
+        "projection on the drives nor friction.",
         "",
         "| regressor, 20 000 rows | us per row |",
         "| --- | ---: |",

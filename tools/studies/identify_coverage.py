@@ -83,7 +83,9 @@ def report(results: list[dict[str, Any]]) -> str:
         f"Each of {len(results)} experiments simulates new logs of the CAT 215 with sensor noise. The "
         f"identification starts from parameters with errors of up to {100 * OFF:.0f} %. In all, {len(away)} "
         "intervals are checked. The 95 % ellipsoid is the joint confidence region of all base parameters of "
-        "an experiment (combinations that the data determine, see [terms](../terms.md)).",
+        "an experiment (combinations that the data determine, see [terms](../terms.md)). +-: half the width of "
+        "the 95 % interval of the percentage. It is larger for the ellipsoid, because each experiment has only "
+        "one.",
         "",
         "| | contain the true value | required |",
         "| --- | ---: | ---: |",
@@ -91,10 +93,11 @@ def report(results: list[dict[str, Any]]) -> str:
         f"| 95 % ellipsoid of all base parameters | {100 * whole:.1f} %"
         f" (+- {100 * 1.96 * np.sqrt(whole * (1 - whole) / len(results)):.1f}) | 93 to 97 % |",
         "",
-        "Each row is one parameter (names as in [identifiability](identifiability.md)). Estimated in: number "
-        "of experiments whose data determine it. Intervals that contain the true value: 95 % is ideal; much "
-        "less means that the intervals are too narrow. Mean error: average of estimate minus true value, in "
-        "standard deviations of the estimate; 0 is ideal.",
+        "Each row is one parameter. `moment` is mass times a coordinate of the centre of mass, `inertia` an "
+        "element of the inertia matrix ([all names](identifiability.md)). Estimated in: number of experiments "
+        "whose data determine it. Intervals that contain the true value: 95 % is ideal; much less means that "
+        "the intervals are too narrow, much more that they are too wide. Mean error: average of estimate minus "
+        "true value, in standard deviations of the estimate; 0 is ideal.",
         "",
         "| parameter | estimated in | intervals that contain the true value | mean error [std] |",
         "| --- | ---: | ---: | ---: |",

@@ -84,8 +84,11 @@ def format_introduction(name: str, count: int, failures: int) -> list[str]:
         " the fault; what was simulated is what the column \"fault\" says.",
         "- `inf`: an event that does not occur, no limit, or different numbers of parameters. `nan`: the quantity does"
         " not exist in a repetition, or has no definition, because",
-        "  the repetitions have no scatter. Very large numbers occur if the fault makes a scatter or a denominator"
-        " almost zero, or if an estimate diverges.", "",
+        "  the repetitions have no scatter.",
+        "- \"Distance\" is the published value minus the mean of the repetitions, over their standard deviation.",
+        "- Very large numbers, such as a distance of 1e+14 standard deviations, have no physical meaning: the fault"
+        " makes the scatter or denominator almost zero, or an",
+        "  estimate diverges. Only the verdict counts.", "",
         "| row | fault | simulated with the fault | range that agrees | verdict |", "| --- | --- | --- | --- | --- |",
     ]  # fmt: skip
 

@@ -31,9 +31,11 @@ def main() -> None:
         "Can random actions break a control task? Long sequences of random steps test that no environment "
         "produces a value that is not finite, an observation outside its stated space, a MuJoCo warning or "
         "an unstable simulation. These four columns must be 0.\n",
-        "Each row is one task with one kind of actions and sensors. Actions are uniformly random, each held "
-        "for a random number of steps; observations are tested after every step. Saturated readings, which "
-        "are allowed, count sensor values beyond the limits of the space that were cut off at the limit. "
+        "Each row is one task with one kind of actions and sensors. Actions are valve commands, rates of the "
+        "axes (`joint_rate`) or rates of the tip (`resolved_motion`); they are uniformly random, each held "
+        "for a random number of steps. Sensors are exact (`ideal`) or have the errors of the machine's "
+        "sensor set (`real`). Observations are tested after every step. Saturated readings count sensor "
+        "values beyond the limits of the observation space; they are set to the limit, so they are allowed. "
         "The last column is the speed of the test.\n",
         "| task | actions | sensors | steps | episodes | not finite | outside the space | MuJoCo's"
         " warnings | unstable | saturated readings | physics steps/s |",

@@ -98,8 +98,8 @@ class Pressures:
 def run_tool(machine: str, tool: str, steps: int, args, rng: np.random.Generator) -> dict:
     """Random commands with one tool.
 
-    Half of the simulations add a drift to their commands, which drives them into limits and ground;
-    a quarter has commands of -1 or 1 only.
+    Half of the simulations add a random mean to their commands, which drives them into limits and ground;
+    a quarter has commands of -1 or 1 only; the rest has commands with the mean 0.
 
     Returns:
         Counts and extremes: steps, nan, warnings, gap [m], speed [rad/s], pressures.
