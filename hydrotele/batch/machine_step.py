@@ -382,13 +382,13 @@ def do_stage(model, sp, z, machines, noise, timing, task, i, stage):
 
 @compile_without_allocation
 def do_before(model, sp, z, machines, noise, timing, task, i, stage):
-    """Call `before_period` only; stands for `do_stage` in a kernel of its own, see `run_task`."""
+    """Call `before_period` only; stands for `do_stage` in a separate kernel, see `run_task`."""
     before_period(task, model, sp, z, machines, i)
 
 
 @compile_without_allocation
 def do_after(model, sp, z, machines, noise, timing, task, i, stage):
-    """Call `after_period` only; stands for `do_stage` in a kernel of its own, see `run_task`."""
+    """Call `after_period` only; stands for `do_stage` in a separate kernel, see `run_task`."""
     after_period(task, model, sp, z, machines, i)
 
 
@@ -467,7 +467,7 @@ def store_machine(model, lanes, machines, i, lane):
 def run_task(model, lanes, machines, noise, timing, task, i):
     """Run a function of the task, which stands for `do_stage`, for machine i with its mechanism placed at the state.
 
-    A CUDA device runs the functions of a task in kernels of their own: these compile in a fraction of the time of
+    A CUDA device runs the functions of a task in separate kernels: these compile in a fraction of the time of
     one kernel with the dynamics, and the kernel with the dynamics is that of all tasks.
     """
     load_machine(model, lanes, machines, i, 0)

@@ -239,6 +239,7 @@ _GRIP_RADII = (2.3, 8.7)  # m from the swing axis, range in which the log can be
 _GOAL_RADII = (4.5, 6.5)  # m, range of the radius of log and goal
 _LOG_ANGLES = (0.15, 0.5)  # rad, range of the angle from the grapple to the log
 _GOAL_ANGLES = (math.radians(30.0), math.radians(90.0))  # rad, range of the angle from log to goal
+_MIN_GOAL_SIZE = 0.25  # of the distance to the goal pose: 7.5 deg at 4.5 m are 0.6 m, twice the tolerance
 _X, _Y, _YAW, _REMAINING_DISTANCE, _TIME_HELD, _WAS_GRIPPED = range(
     MEASURED_START + MEASURED_COUNT, MEASURED_START + MEASURED_COUNT + 6
 )  # in `goal`
@@ -272,7 +273,9 @@ def list_place_observation_fields(machine: Machine, axes: tuple[str, ...]) -> li
 def draw_log_poses(f, e, w):
     """Draw the start pose and the goal pose of the log on the ground, both with random yaw.
 
-    The swing of the grapple is measured for the first time.
+    A difficulty below 1 moves the log towards the grapple, and the goal pose towards the log; their distance is at
+    least a quarter of that of the task, so that the log does not lie at its goal from the start. The swing of the
+    grapple is measured for the first time.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `pack_grapple_parameters`.
@@ -286,18 +289,19 @@ def draw_log_poses(f, e, w):
     """
     g, pose, at = e.goal, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
     compute_tip_pose(f.arm, arm_values(f, e.position, np.empty(MAX_ARM_AXES)[: f.arm_axes]), pose)
+    near, goal = f.difficulty, max(f.difficulty, _MIN_GOAL_SIZE)
     radius, theta = (
-        draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
-        pose[1] + _draw_with_random_sign(e, _LOG_ANGLES),
+        near * draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]) + (1.0 - near) * pose[0],
+        pose[1] + near * _draw_with_random_sign(e, _LOG_ANGLES),
     )
     half = 0.5 * draw_uniform_between(e, 0.0, math.pi)
     w.qpos[at], w.qpos[at + 1] = radius * math.cos(theta), radius * math.sin(theta)
     w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5] = math.cos(half), 0.0, 0.0
     w.qpos[at + 6] = math.sin(half)
-    theta += _draw_with_random_sign(e, _GOAL_ANGLES)
-    radius = draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1])
+    theta += goal * _draw_with_random_sign(e, _GOAL_ANGLES)
+    radius = goal * draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]) + (1.0 - goal) * radius
     g[_X], g[_Y] = radius * math.cos(theta), radius * math.sin(theta)
-    g[_YAW] = draw_uniform_between(e, 0.0, math.pi)
+    g[_YAW] = goal * draw_uniform_between(e, 0.0, math.pi) + (1.0 - goal) * 2.0 * half
     g[_REMAINING_DISTANCE], g[_TIME_HELD], g[_WAS_GRIPPED] = -1.0, 0.0, 0.0
     measure_free_joints(f, e, w)
 

@@ -81,6 +81,23 @@ def test_difficulty_shortens_paths():
     assert distances[0] < 0.5 * distances[1]
 
 
+def test_difficulty_brings_log_and_goal_closer():
+    near, far = (make_task_core("PlaceLog", SHORT | {"difficulty": d}, 16, 1, DISABLED) for d in (0.25, 1.0))
+    ways = []
+    for core in (near, far):
+        core.reset(np.arange(16))
+        places = {field.name: i for i, field in enumerate(core.setup.fields)}
+        where = [core.observation[:, [places[f"{what}.r"], places[f"{what}.theta"]]] for what in ("tip", "log", "goal")]
+        points = [r * np.exp(1j * theta) for r, theta in (np.moveaxis(values, 1, 0) for values in where)]
+        core.step(np.zeros(core.action.shape))
+        yaw = core.measures[:, 1]
+        ways.append((abs(points[1] - points[0]), abs(points[2] - points[1]), yaw))
+    (to_log, to_goal, turn), (all_the_way, whole, full_turn) = ways
+    assert to_log.mean() < 0.4 * all_the_way.mean()
+    assert to_goal.mean() < 0.4 * whole.mean() and to_goal.min() > 0.5  # outside the tolerance of 0.3 m
+    assert turn.mean() < 0.4 * full_turn.mean()
+
+
 def test_difficulty_widens_the_tolerances_of_a_pose():
     core = make_task_core("ReachFeller", SHORT | {"difficulty": 0.01}, 4, 1, DISABLED)  # 5 m and 3 rad
     core.reset(np.arange(4))
