@@ -137,8 +137,8 @@ class Options:
             then has the additional term gamma Phi(s') - Phi(s), with the task's potential Phi. It does
             not change which policies are optimal for this gamma. 0: no additional term.
         difficulty: size of the goals, at most 1 (full size), for a curriculum. It multiplies rates of references,
-            length and speed of lines, distance of poses, and in `PlaceLog` the way of the grapple to the log and at least
-            a quarter of the way of the log to its goal; tolerances of poses are divided by it.
+            length and speed of lines and distance of poses; tolerances of poses are divided by it. In `PlaceLog` it
+            multiplies the distances from grapple to log and from log to goal, the latter by at least 0.25.
         start: positions of axes at the start of every episode [rad] or [m]; those of other axes are random.
     """
 
