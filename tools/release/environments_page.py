@@ -12,7 +12,7 @@ from tools.studies.study import options, publish
 
 COMMON = """\
 This page is the reference of the control tasks: goal, reward, end of an episode, observation, actions and options of
-each. [Train and compare controllers](train.md) describes how to use them. The command above writes this page from the
+each. [Train and compare controllers](train.md) describes how to use them. The command writes this page from the
 source code.
 
 Each task is a [gymnasium](https://gymnasium.farama.org) environment: `gymnasium.make("hydrotele/NAME-v0", **options)`
