@@ -17,7 +17,7 @@ The log is a CSV or Parquet file of a compensatory tracking task, in which the o
 difference of target and response. Its columns are time, target, response and hand. Other names are
 given with --time, --target, --response and --hand. For a stick that does not move, the force takes
 the place of the hand position: a column force is used if there is no column hand, and --hand gives
-a force column with another name. It must contain at least 20 s at 10 Hz or more; narrow confidence
+a force column with another name. The log must contain at least 20 s at 10 Hz or more; narrow confidence
 intervals need two minutes or more. A scenario uses the written file by
 pilot: {perception: {file: operator_7/operator.yaml}}.
 """

@@ -354,7 +354,7 @@ def replay(
             help="Number of machines that are sampled from the posterior, if --machine is a result folder"
             " of gap. They give a"
             " 95 % prediction band, which contains parameter uncertainty and measurement noise, but not"
-            " missing effects.",
+            " missing effects: much more than 5 % of the readings outside point to such an effect.",
         ),
     ] = 0,
     effects: EffectFilesOption = None,
