@@ -65,7 +65,7 @@ def linkage(
 ) -> None:  # fmt: skip
     """Calibrate the cylinder linkages of an arm from joint angles and cylinder lengths.
 
-    Every fifth sample tests the result and is not fitted.
+    Every fifth sample tests the result and is not fitted; --heldout is refused here.
     """
     from hydrotele.cli.calibrate_linkage_command import calibrate_linkage
 

@@ -75,14 +75,14 @@ A sweep file:
 
 \b
 After an interruption (Ctrl-C, kill), the same command continues with the missing runs. Failed runs
-are listed and appear in the table with the reason. The exit status is 0 if some runs failed and 3
-if all failed.
+are listed and appear in the table with the reason; --retry-failed repeats them. The exit status is 3
+if all runs failed, otherwise 0; with --strict it is 3 if any run failed.
 """
 
 IMPORT_EPILOG = """\b
 Examples:  hydrotele import field.mcap --write-mapping field.yaml --machine my_excavator
            hydrotele import field.mcap --mapping field.yaml --machine my_excavator --out logs
-           hydrotele import bag_folder sensors.mat --merge --out run_1.parquet
+           hydrotele import bag_folder sensors.mat --merge --mapping both.yaml --out run_1.parquet
 
 \b
 The command reads ROS 1 bags (.bag), ROS 2 bags (folder, .db3, .mcap), plain MCAP, MATLAB files

@@ -14,8 +14,10 @@ Examples:  hydrotele identify-operator tracking.csv --out operator_7
 
 \b
 The log is a CSV or Parquet file of a compensatory tracking task, in which the operator sees the
-difference of target and response. Its columns are time, target, response and hand (or force, for a
-stick that does not move). It must contain at least 20 s at 10 Hz or more; narrow confidence
+difference of target and response. Its columns are time, target, response and hand. Other names are
+given with --time, --target, --response and --hand. For a stick that does not move, the force takes
+the place of the hand position: a column force is used if there is no column hand, and --hand gives
+a force column with another name. The log must contain at least 20 s at 10 Hz or more; narrow confidence
 intervals need two minutes or more. A scenario uses the written file by
 pilot: {perception: {file: operator_7/operator.yaml}}.
 """
@@ -27,7 +29,13 @@ def identify_operator(
     time: Annotated[str | None, typer.Option(help="Name of the time column. Default: time.")] = None,
     target: Annotated[str | None, typer.Option(help="Name of the column of the target. Default: target.")] = None,
     response: Annotated[str | None, typer.Option(help="Name of the column of the response. Default: response.")] = None,
-    hand: Annotated[str | None, typer.Option(help="Name of the column of the hand position. Default: hand.")] = None,
+    hand: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the column of the hand position, or of the force on a stick that does not move. Default:"
+            " hand, or force if there is no column hand."
+        ),
+    ] = None,
     equalisation: Annotated[
         str | None,
         typer.Option(help="Form of the operator model: gain, lead, lag or integral. Default: the form that fits best."),

@@ -52,8 +52,8 @@ EffectFilesOption = Annotated[
         "--effects",
         metavar="FILE.py",
         callback=_load_effect_files,
-        help="Python file that defines custom effects or laws. The file is run as Python code, so use only"
-        " files that you trust. Can be given several times.",
+        help="Python file that defines custom effects or laws, which are added to those of the library. The file"
+        " is run as Python code, so use only files that you trust. Can be given several times.",
     ),
 ]
 
@@ -354,7 +354,7 @@ def replay(
             help="Number of machines that are sampled from the posterior, if --machine is a result folder"
             " of gap. They give a"
             " 95 % prediction band, which contains parameter uncertainty and measurement noise, but not"
-            " missing effects.",
+            " missing effects: much more than 5 % of the readings outside point to such an effect.",
         ),
     ] = 0,
     effects: EffectFilesOption = None,
@@ -390,7 +390,10 @@ def gap(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: gap_DATA.")] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option("--effect", help="Test only this effect of `hydrotele list effects`. Can be given several times."),
+        typer.Option(
+            "--effect",
+            help="Restrict the search to this effect of `hydrotele list effects`. Can be given several times.",
+        ),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of parallel processes.")] = None,
     mask: Annotated[
@@ -613,7 +616,8 @@ def analyse_teleop(
             "--structure",
             help="Structure to analyse: position_position, position_force, four_channel_position, rate_position, "
             "rate_force or four_channel_rate; with --robust also wave_variables and "
-            "passivity_control. Can be given several times. Default: those of the case.",
+            "passivity_control. Can be given several times. Default: those of the case, and with --robust"
+            " also these two.",
         ),
     ] = None,
     delay: Annotated[
@@ -730,9 +734,9 @@ def validate(
 ) -> None:
     """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
-    Values of a machine file on lines with the comment "# estimate" are listed in the order in which
-    they should be replaced. Logs are checked against the column names and ranges of the machine, as
-    gap does.
+    Values of a machine file on lines with the comment "# estimate" are listed in the order in which they
+    should be replaced: geometry and areas first, which determine forces and speeds. Logs are checked
+    against the column names and ranges of the machine, as gap does.
     """
     from hydrotele.cli.validate_command import LogMachine, validate_files
 

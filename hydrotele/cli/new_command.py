@@ -32,9 +32,10 @@ def machine(
 ) -> None:
     """Create machine.yaml, MJCF, meshes and a first scenario from a robot description.
 
-    Geometry, joint limits and plausible masses come from the description. Cylinders, valves, pump and
-    the masses that are implausible there are estimates for machines of this size. They are marked in
-    machine.yaml, and `hydrotele validate` lists them.
+    Geometry, joint limits and plausible masses come from the description, and cylinders if it models
+    them. Bores, valves, pump, other cylinders and masses that are implausible there are estimates for
+    machines of this size. They have the comment `# estimate` in machine.yaml, and `hydrotele validate`
+    lists them.
     """
     create_machine_folder(name, source, tuple(package_path or ()), json)
 

@@ -13,8 +13,8 @@ def _end_stop_axes(machine: Machine) -> tuple[str, ...]:
 def _stiffness_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the stiffness of a drive's end stops.
 
-    The bounds are 1 % and 20 times the given stiffness, because a cushion is fifty times more compliant
-    than steel. The smallest relevant change is 10 %.
+    The bounds are wide, 1 % and 20 times the given stiffness: a cushion, for example, is fifty times
+    more compliant than steel. The smallest relevant change is 10 %.
     """
     stop = machine.end_stop(location)
     assert stop

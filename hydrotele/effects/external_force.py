@@ -50,8 +50,8 @@ def _pulse_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of amplitude, start and duration of a force pulse.
 
     The smallest relevant amplitude is three times that of a constant force, so that a pulse of one
-    second is detectable. If the machine has no pulse, a search begins with the nominal start and duration
-    of 5 s.
+    second is detectable. A size of 0 means no pulse. The nominal start and duration of 5 s are then only
+    the values with which a search begins.
     """
 
     def present_value(parameter: str, absent: float) -> float:
@@ -77,9 +77,9 @@ def _set_pulse(machine: Machine, location: str, values: Values) -> Machine:
 def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the coefficient of drag, force over speed squared.
 
-    Bounds and prior are fractions of the drive's largest force over the square of its typical
-    speed: 20 % above the nominal value for the upper bound, 1.5 % for the prior standard deviation,
-    and 0.1 % for the smallest relevant change.
+    Let c_0 be the drive's largest force over the square of its speed at the rated flow. The upper bound
+    is the nominal value plus 0.2 c_0, the prior standard deviation 0.015 c_0, and the smallest relevant
+    change 0.001 c_0.
     """
     present = term_parameter(machine, SPEED_DEPENDENT_FORCE, location, "force", "coefficient", 0.0)
     whole = max_drive_force(machine, location) / typical_speed(machine, location) ** 2

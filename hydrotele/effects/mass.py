@@ -55,7 +55,7 @@ def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]
     """Return nominal value (1), bounds and prior of the ratio of true to given moments of inertia.
 
     A model from drawings is accurate to about 20 %. The smallest relevant change is 5 %, a typical
-    rounding. The bounds include attachments, ballast, and a wrong unit in the drawings.
+    rounding. The wide bounds allow for attachments, ballast, or a wrong unit in the drawings.
     """
     return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, start_values=(1.0, 6.0))}
 

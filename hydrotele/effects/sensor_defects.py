@@ -61,8 +61,8 @@ def _make_position_error_setter(field: str, parameter: str):
 def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of drift and warm-up time constant of a position sensor.
 
-    The drift is the change of the sensor's offset from start to warm state. Its bounds about the
-    nominal drift and its prior are those of an offset. The time constant is optional.
+    The drift is the change of the sensor's offset from start to warm state. Bounds and prior are
+    those of the constant offset (effect angle_offset), about the nominal drift. The time constant is optional.
     """
     error = _sensor_error(machine, _position_channel(machine, location))
     sizes = _angle_offset_parameters(machine, location)["offset"]

@@ -248,8 +248,8 @@ def _travel_time_parameters(machine: Machine, location: str) -> dict[str, Parame
 
     It is the reciprocal of the valve's slew limit; 0 means no speed limit. With the bandwidth w of
     the spool [rad/s] and no limit, the spool moves by at most 0.38 w of its travel per second in a
-    full step (damping ratio 0.9). A limit therefore has an effect for times above 2.6 / w. Prior
-    and bounds are estimates.
+    full step (damping ratio 0.9). A limit has an effect only if it is lower than this speed, that is, for
+    a travel time above 1 / (0.38 w) = 2.6 / w. Prior and bounds are estimates.
     """
     valve = machine.axes[location].valve
     assert valve
