@@ -19,8 +19,12 @@ listen on addresses other than 127.0.0.1 only in a private network.
 
 def haptic_device(
     kind: Annotated[
-        str, typer.Option("--kind", help="Kind of device: simulated, force-dimension, haption, or haption:HOST#PORT if the service of the vendor"
-            " runs on another computer.")
+        str,
+        typer.Option(
+            "--kind",
+            help="Kind of device: simulated, force-dimension, haption, or haption:HOST#PORT if the vendor's service"
+            " runs on another computer.",
+        ),
     ] = "simulated",
     host: Annotated[str, typer.Option("--host", help="Network address on which the server listens.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0 means any free port.")] = 5610,

@@ -263,7 +263,9 @@ LogsOption = Annotated[
     list[Path],
     typer.Option("--data", "-d", help="Log file, folder of logs, or run folder (output of `hydrotele run`)."),
 ]
-MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More logs: --data A B C means --data A --data B --data C.")]
+MoreLogsArgument = Annotated[
+    list[Path] | None, typer.Argument(help="More logs: --data A B C means --data A --data B --data C.")
+]
 HeldOutOption = Annotated[
     str | None,
     typer.Option(
@@ -856,7 +858,12 @@ def experiments(
 )
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Print the results of an earlier --save next to the new ones, with their ratio.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare", help="Print the results of an earlier --save next to the new ones, with their ratio."
+        ),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions; less accurate.")] = False,
     device: Annotated[
         str | None,

@@ -21,8 +21,8 @@ rad and N m for rotary, m and N for linear axes. `PUMP` is the name of a pump of
 ## Measured channels
 
 Sensor readings, signals of the controller, and estimates, in `measured.parquet` of a simulated run and in logs of real
-machines. hydrotele computes the estimates `tip_force`, `contact` and `load`; you need not supply them. To exclude rows of
-your own log, add a column `valid`.
+machines. hydrotele computes the estimates `tip_force`, `contact` and `load`; you need not supply them. To exclude rows
+of your own log, add a column `valid`.
 
 {_format_table(MEASURED_KINDS, "")}
 
