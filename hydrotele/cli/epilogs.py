@@ -14,7 +14,7 @@ well. Horizons longer than the run are omitted.
 \b
 A result folder of gap with posterior.parquet also gets a 95 % prediction band, from machines sampled
 from the posterior. The band contains parameter uncertainty and measurement noise, but not missing effects:
-about 95 % of the readings are inside if the model is complete, and fewer if an effect is missing.
+about 95 % of the readings are inside if the model is complete. Far fewer suggest a missing effect.
 
 \b
 Black-box models, fitted on the other runs (--baseline, repeatable):
