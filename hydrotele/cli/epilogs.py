@@ -13,7 +13,8 @@ well. Horizons longer than the run are omitted.
 
 \b
 A result folder of gap with posterior.parquet also gets a 95 % prediction band, from machines sampled
-from the posterior. The band contains parameter uncertainty and measurement noise, but not missing effects.
+from the posterior. The band contains parameter uncertainty and measurement noise, but not missing effects:
+about 95 % of the readings are inside if the model is complete. Far fewer suggest a missing effect.
 
 \b
 Black-box models, fitted on the other runs (--baseline, repeatable):
@@ -32,7 +33,9 @@ Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
 Keyboard: each key press changes the command of an axis by a quarter of its maximum. The command
 then stays constant; the space bar sets all commands to zero.
   Up, Down: out, in        Left, Right: swing    Page Up, Page Down: raise, lower
-  End, Home: curl in, out  Insert, Delete: head  7, 6 and 9, 8: additional axes (grab, saw) up, down
+  End, Home: curl in, out  Insert, Delete: turn the head
+  7, 6: command of the first additional axis (such as the grab) up, down
+  9, 8: command of the second additional axis (such as the saw) up, down
   F10, Ctrl-C or closing the window: stop and write the logs
 
 \b

@@ -7,7 +7,7 @@ import typer
 HAPTIC_EPILOG = """\b
 Examples:  hydrotele haptic-device    # simulated device, for hydrotele drive --device haptic
            hydrotele haptic-device --kind force-dimension --host 0.0.0.0   # machine on another PC
-           hydrotele haptic-device --kind "haption:192.168.0.5#5000"       # device on another PC
+           hydrotele haptic-device --kind "haption:192.168.0.5#5000"       # the vendor's service runs on another PC
 
 \b
 The server reads the handle pose and writes forces at 1 kHz. It communicates by UDP; the protocol is
@@ -19,7 +19,12 @@ listen on addresses other than 127.0.0.1 only in a private network.
 
 def haptic_device(
     kind: Annotated[
-        str, typer.Option("--kind", help="Kind of device: simulated, force-dimension, haption or haption:HOST#PORT.")
+        str,
+        typer.Option(
+            "--kind",
+            help="Kind of device: simulated, force-dimension, haption, or haption:HOST#PORT if the vendor's service"
+            " runs on another computer.",
+        ),
     ] = "simulated",
     host: Annotated[str, typer.Option("--host", help="Network address on which the server listens.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0 means any free port.")] = 5610,

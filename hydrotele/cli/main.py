@@ -263,7 +263,9 @@ LogsOption = Annotated[
     list[Path],
     typer.Option("--data", "-d", help="Log file, folder of logs, or run folder (output of `hydrotele run`)."),
 ]
-MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More logs, after --data PATH.")]
+MoreLogsArgument = Annotated[
+    list[Path] | None, typer.Argument(help="More logs: --data A B C means --data A --data B --data C.")
+]
 HeldOutOption = Annotated[
     str | None,
     typer.Option(
@@ -506,7 +508,8 @@ def identify(
     """Identify masses, friction and hydraulics from logs; write the identified machine.
 
     With --mjcf, any mechanism with hinge, slide and ball joints can be identified. Its kinematic
-    loops must be closed by connect or weld constraints.
+    loops must be closed by connect or weld constraints. The exit status is 1 if the identified model predicts no
+    force of the held-out run better than zero force does.
     """
     from hydrotele.cli.identify_command import (
         IdentificationOptions,
@@ -708,8 +711,8 @@ def list_(
     what: Annotated[
         str | None,
         typer.Argument(
-            help="What to list with descriptions: machines, joysticks, scenarios, sweeps, effects,"
-            " environments, plugins or all. Default: the names of everything."
+            help="Kind of items to list with descriptions: machines, joysticks, scenarios, sweeps, effects,"
+            " environments, plugins or all. Without it, the names of all items are listed, without descriptions."
         ),
     ] = None,
     effects: EffectFilesOption = None,
@@ -840,9 +843,11 @@ def experiments(
 ) -> None:
     """Repeat the experiments of a publication; compare its tables and figures with simulation.
 
-    Each row states the published value, the simulated one with its 95 % interval, and a verdict. The
-    verdicts are agrees, differs (with the measured reason), undecided (the interval is partly inside and partly
-    outside the accepted range), or cannot be computed. The exit status is 1 if a published result differs.
+    Each row states the published value, the simulated one with its 95 % interval, the accepted range with its
+    source, and a verdict. The verdict is agrees if the interval is inside the accepted range, differs if it is
+    outside, undecided if it is partly inside, or cannot be computed. The reason of a difference is stated in the
+    row. The exit status is 1 if a result of the publication differs; other rows (model inputs, additional results
+    that are not in the publication) do not change it.
     """
     from hydrotele.cli.experiments_command import experiments_to_folder
 
@@ -857,7 +862,12 @@ def experiments(
 )
 def bench(
     save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Compare with the results in this file.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            "--compare", help="Print the results of an earlier --save next to the new ones, with their ratio."
+        ),
+    ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions; less accurate.")] = False,
     device: Annotated[
         str | None,

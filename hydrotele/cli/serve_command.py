@@ -25,7 +25,12 @@ authentication: listen on addresses other than 127.0.0.1 only in a private netwo
 def serve(
     scenario: Annotated[str, typer.Argument(help="Name of a shipped scenario, or a YAML file. Its pilot is not used.")],
     realtime: Annotated[
-        bool, typer.Option("--realtime", help="Simulate in real time instead of waiting for the client (lockstep).")
+        bool,
+        typer.Option(
+            "--realtime",
+            help="Simulate in real time, with the last commands, also while the client computes. Default: wait for the"
+            " client (lockstep).",
+        ),
     ] = False,
     duration: Annotated[
         float | None, typer.Option(min=0.1, help="Longest duration [s]. Default: that of the scenario.")

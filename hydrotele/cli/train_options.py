@@ -21,8 +21,8 @@ Ctrl-C ends the training and keeps the policy; --resume continues it.
 \b
 Options of the environment (--set) are those of gymnasium.make: action, sensors, control_rate,
 duration, effects, randomise, variants, ... With the default
---curriculum, the goals grow during the first 40 % of the training. A policy that was trained with
---device cpu is evaluated on MuJoCo, too.
+--curriculum, the goals grow during the first 40 % of the training. With
+--device cpu only the training uses the reduced model; the scores are those on MuJoCo.
 """
 
 RECORD_EPILOG = """\b

@@ -101,8 +101,8 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 def _entrained_air_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the volume fraction of air in the oil.
 
-    The oil of a working machine contains 0.5 to 5 %. The smallest relevant fraction is 0.2 %, which is
-    hardly measurable at pressures above 2 MPa.
+    The oil of a working machine contains 0.5 to 5 %. The smallest relevant fraction is 0.2 %; so
+    little air is hardly measurable at pressures above 2 MPa.
     """
     assert machine.supply
     present = machine.supply.entrained_air

@@ -29,7 +29,8 @@ def _compensator_parameters(machine: Machine, location: str) -> dict[str, Parame
 
     It is 1 minus the largest pressure drop across the inlet edge of the spool over the relief
     pressure; 0 means no compensator. Usual are 0.9 to 0.98 (estimate). The smallest relevant change
-    is 0.1, which has an effect only at low load and full supply pressure.
+    is 0.1. A compensator with 0.1 limits the drop to 90 % of the relief pressure, and larger drops occur
+    only at low load and full supply pressure.
     """
     assert machine.supply
     present = 1.0 - _max_inlet_drop(machine, location) / machine.supply.relief_pressure

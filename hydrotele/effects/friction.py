@@ -148,8 +148,9 @@ def _position_range(machine: Machine, location: str) -> tuple[float, float]:
 def _bump_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of additional dry friction at one position of a drive.
 
-    The parameters are its height (a friction force), centre and width. The nominal width is a tenth of
-    the travel, as for a bent rod or a worn tooth.
+    The parameters are its height `coulomb` (a friction force), `centre` and `width`. A height of 0 means
+    no additional friction. Centre and width are then without effect; their nominal values, the middle
+    and a tenth of the travel (as of a bent rod or a worn tooth), are the means of their priors.
     """
 
     def present_value(parameter: str, absent: float) -> float:

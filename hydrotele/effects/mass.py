@@ -93,8 +93,9 @@ def _payload_locations(machine: Machine) -> tuple[str, ...]:
 def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (0), bounds and prior of the mass of a payload at the arm's tip.
 
+    The mass cannot be negative: the effect does not correct a tool that is too heavy in the machine file.
     Bounds and prior are fractions of the mass that the boom joint moves. The smallest relevant payload
-    is 0.6 % of it, 15 kg of 2.5 t; seal friction hides smaller ones.
+    is 0.6 % of it, such as 15 kg for 2.5 t; seal friction hides smaller ones.
     """
     assert machine.arm
     arm = outboard_links(machine, machine.link_of(machine.arm.boom))

@@ -128,9 +128,8 @@ def _motor_drag_parameters(machine: Machine, location: str) -> dict[str, Paramet
 def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value, bounds and prior of the coefficient of viscous drag of motor and pump.
 
-    Bounds and prior are fractions of the motor's stall torque over the pump's rated speed: 50 %
-    above the nominal value for the upper bound, 5 % for the prior standard deviation, 1 % for the
-    smallest relevant change.
+    Let b_0 be the motor's stall torque over the pump's rated speed. The upper bound is the nominal value
+    plus 0.5 b_0, the prior standard deviation 0.05 b_0, and the smallest relevant change 0.01 b_0.
     """
     present = _get_pump_motor(machine, location).viscous
     whole = _stall_torque(machine, location) / _get_axis_pump(machine, location).rated_speed
@@ -147,7 +146,8 @@ def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
     Bounds and priors are proportional to compliance and volume of the oil in the connected chamber
     at mid-stroke. A hose is typically several times more compliant than its oil. The air volume is
-    stated at atmospheric pressure; a few per cent of the oil volume are typical.
+    stated at atmospheric pressure. A few per cent of the oil volume are typical; the prior standard
+    deviation is 5 %.
     """
     axis, _, side = location.partition(".")
     drive, pump = machine.axes[axis].cylinder, _get_axis_pump(machine, axis)

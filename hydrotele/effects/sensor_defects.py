@@ -154,7 +154,7 @@ def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Pa
 
     Bounds and prior are fractions of the span, which is taken to be the highest feed pressure of
     the axis. The typical offset is 0.5 % of it, the accuracy class. The smallest relevant change is
-    0.07 %, since the repeatability is better than 0.1 %.
+    0.07 %, similar to the repeatability of a transducer (better than 0.1 %).
     """
     present = _sensor_error(machine, _pressure_channel_of_location(location)).offset
     span = machine.max_feed_pressure(location.rpartition(".")[0])
@@ -250,8 +250,8 @@ def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Param
     """Return nominal value, bounds and prior of the time by which a group of sensors is recorded late.
 
     The time is relative to commands and other sensors. It is never negative, because readings would
-    then respond before their command. A group that is early relative to the other group is
-    described by a late other group. Typical offsets are about 10 ms; the smallest relevant change
+    then respond before their command. If one group is early relative to the other, the other group is
+    the location: early pressures are late positions. Typical offsets are about 10 ms; the smallest relevant change
     is 3 ms.
     """
     present = _common_delay_or_lag(machine, _clock_groups(machine)[location], "delay")

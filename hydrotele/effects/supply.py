@@ -74,9 +74,9 @@ def _pump_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter
 def _relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values, bounds and priors of pressure and override of the main relief valve.
 
-    The override is the pressure rise per flow through the open valve; only a pump of constant flow has
-    it as a parameter. The smallest relevant change of the pressure is 0.3 %, the finest mark of a gauge.
-    The pressure typically rises by 10 % up to full pump flow; the smallest relevant rise is 1 %.
+    The smallest relevant change of the pressure is 0.3 %, the finest mark of a gauge. The override is the
+    pressure rise per flow through the open valve. It is a parameter only if the pump has constant flow.
+    Typically it raises the pressure by 10 % at full pump flow; the smallest relevant rise is 1 %.
     """
     supply = _pump_at(machine, location)
     p, present = supply.relief_pressure, supply.relief_override

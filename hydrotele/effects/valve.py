@@ -164,9 +164,9 @@ _CURVE_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
 def _flow_curve_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal value (0), bounds and prior of the flow curve's progression for each direction.
 
-    A positive progression reduces the opening at small travel compared with a linear valve; see
-    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Spools for fine control reach
-    0.6; the smallest relevant progression is 0.04, as caused by notches (estimates).
+    A positive value reduces the opening at small travel compared with a linear valve: with 0.3 the
+    opening at half travel is 42 %. Spools for fine control reach 0.6; the smallest relevant value is
+    0.04, as caused by notches (estimates).
     """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 

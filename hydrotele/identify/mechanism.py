@@ -52,14 +52,17 @@ class ColumnMapping(StrictModel):
             all. If both noises are stated, the covariance follows from them, and the bias caused by
             position noise is subtracted.
         force_noise: standard deviation of a force reading [N] or [N m], per drive or one for all.
-        coordinates: joints in which the motion is described and filtered, such as those of a
-            platform, if they differ from the measured joints.
+        coordinates: joints whose positions describe the motion; by default the measured joints. If other
+            joints are named, such as those of the platform of a hexapod with measured legs, the
+            measured positions are converted to theirs before they are filtered.
         passive_friction: joints without drive, and closures, that have friction.
         equal_parameters: groups of bodies or joints that have the same parameters.
         zero_parameters: parameters known to be 0, such as `moment_x.stator_*`.
         offsets: whether drives may have constant forces.
-        friction: joint -> friction that an MJCF cannot state, such as `stribeck`, `quadratic`,
-            `viscous_asymmetry`; see `FrictionTerm`. `stribeck_velocity` is that of `stribeck`.
+        friction: joint -> friction that an MJCF cannot state. With the velocity v and s = sign(v), it is
+            (coulomb + stribeck exp(-(v / stribeck_velocity)^2)) s + viscous v + quadratic v^2 s, in N
+            and m/s, or N m and rad/s. `coulomb_asymmetry`, `stribeck_asymmetry` and `viscous_asymmetry`
+            add the same terms with s^2 instead of s, and v s instead of v.
         sensor_errors: `position.JOINT` or `force.DRIVE` -> known defect of its sensor, which is
             removed from the readings (after a sign reversal by the mapping).
         relative_uncertainty: relative uncertainty of masses, inertias and friction of the MJCF. A gap search

@@ -20,7 +20,9 @@ rad and N m for rotary, m and N for linear axes. `PUMP` is the name of a pump of
 
 ## Measured channels
 
-Sensor readings and signals of the controller, in `measured.parquet` of a simulated run and in logs of real machines.
+Sensor readings, signals of the controller, and estimates, in `measured.parquet` of a simulated run and in logs of real
+machines. hydrotele computes the estimates `tip_force`, `contact` and `load`; you need not supply them. To exclude rows
+of your own log, add a column `valid`.
 
 {_format_table(MEASURED_KINDS, "")}
 

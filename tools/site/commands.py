@@ -29,7 +29,9 @@ def format_command(command: Any, words: str, level: int = 1) -> list[str]:
     options = [p for p in command.params if p.param_type_name == "option" and not p.hidden]
     if not commands:
         needed = [f"{p.opts[0]} {_value_name(p)}" for p in options if p.required]
-        typed = [f"hydrotele {words}", *map(_argument, arguments), *needed, "[OPTIONS]" if options else ""]
+        last = [_argument(p) for p in arguments if p.name == "more"]  # values that follow those of an option
+        first = [_argument(p) for p in arguments if p.name != "more"]
+        typed = [f"hydrotele {words}", *first, *needed, *last, "[OPTIONS]" if options else ""]
         parts.append(f"Usage:\n\n```console\n{' '.join(word for word in typed if word)}\n```")
     if arguments:
         rows = [f"| `{_argument(p)}` | {_escape(p.help or '')} | {_default(p)} |" for p in arguments]

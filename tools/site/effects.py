@@ -61,7 +61,9 @@ def format_page(effect: Effect) -> str:
         f"Valid values of `location` on the machine `{machine.name}`: {places}.",
         "## Parameters",
         f"Each row is a parameter, with the values for the location `{picture.location}` of `{machine.name}`; other"
-        " machines have other values. The [index](index.md#columns-of-the-parameter-tables) explains the columns.",
+        " machines have other values. A scenario and `hydrotele gap` state the value with the effect, not the change:"
+        " it replaces *nominal*, the value without the effect. The [index](index.md#columns-of-the-parameter-tables)"
+        " explains the columns.",
         "| parameter | unit | nominal | lowest | highest | prior standard deviation | smallest relevant change |\n"
         "| --- | --- | ---: | ---: | ---: | ---: | ---: |\n" + "\n".join(rows),
         (inspect.getdoc(effect.parameters) or "").partition("\n\n")[2].replace("\n\n", "\n"),
@@ -134,7 +136,8 @@ def list_pages() -> dict[str, str]:
         "## Columns of the parameter tables",
         "| column | meaning |\n| --- | --- |\n"
         "| unit | SI unit; 1 for a ratio |\n"
-        "| nominal | value in the machine file, that is, without the effect |\n"
+        "| nominal | value without the effect: that of the machine file or, for a parameter that the machine file does"
+        " not have, the default of the effect |\n"
         "| lowest, highest | limits of the value in `hydrotele gap` and in a scenario |\n"
         "| prior standard deviation | how far the value typically differs from nominal. `hydrotele gap` uses a normal"
         " prior about the nominal value with this standard deviation |\n"

@@ -20,7 +20,8 @@ LINK = re.compile(r"\]\((?!https?:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 INDEX = """# Reference
 
 These pages define every key of a file, column of a log, effect, option of a command and function of the Python API.
-The pages are generated from the program, so they describe the installed version.
+The pages are generated from the program, so they hold for the version in the footer.
+`hydrotele --version` prints yours. If it differs, use the texts of `hydrotele COMMAND --help`.
 
 | page | content |
 | --- | --- |
