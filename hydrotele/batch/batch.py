@@ -84,17 +84,21 @@ class Batch:
             task: functions and arrays that run in the step of each machine.
             options: `threads`, number of threads of the CPU (one per processor by default); `channels`, names
                 of the channels that are read (all by default); `start`, (k, n) states from which machines
-                start (at rest by default).
+                start (at rest by default); `precision`, "double", or "mixed" to compute mass matrix and forces of
+                the mechanism in float32 (by default "double" on the CPU and "mixed" on a CUDA device).
 
         Raises:
             InputError: the machine has a sensor with a delay or a lag, variants have different structures, an
                 option is unknown, or there is no CUDA device.
         """
-        unknown = set(options) - {"threads", "channels", "start"}
-        if unknown:
-            raise InputError("batch", f"has no option {', '.join(sorted(unknown))}: threads, channels, start")
+        known = ("channels", "precision", "start", "threads")
+        if unknown := set(options) - set(known):
+            raise InputError("batch", f"has no option {', '.join(sorted(unknown))}: {', '.join(known)}")
         if device not in ("cpu", "cuda"):
             raise InputError("batch", f"device must be cpu or cuda, not {device!r}")
+        precision = options.get("precision", "double" if device == "cpu" else "mixed")
+        if precision not in ("double", "mixed"):
+            raise InputError("batch", f"precision must be double or mixed, not {precision!r}")
         variants = [machine] if isinstance(machine, Machine) else list(machine)
         self.machine, self.count, self.device = variants[0], count, device
         self.channels = tuple(options.get("channels", predicted_channels(self.machine)))
@@ -110,12 +114,13 @@ class Batch:
             start = np.array([rest_machine_state(v, m) for v, m in zip(variants, models, strict=True)])
         self._start_of_machine = np.arange(count) % len(start)
         self.machines = _make_machines(models, np.ascontiguousarray(start, float), count, self._timing, seed)
+        code = trace_mechanism(self._single, self.model, precision)
         if device == "cuda":
             from hydrotele.batch.cuda_kernel import CudaRunner
 
-            self._runner: Any = CudaRunner(self._single, self.model, task, self.machine.terms)
+            self._runner: Any = CudaRunner(self._single, code, task, self.machine.terms)
         else:
-            self._runner = _ThreadRunner(self._single, self.model, task, options.get("threads", 0))
+            self._runner = _ThreadRunner(self._single, code, task, options.get("threads", 0))
         self.machines, self.model, self._noise, self._timing, self.task_arrays = map(
             self._runner.upload, (self.machines, self.model, self._noise, self._timing, task.arrays)
         )
@@ -317,9 +322,8 @@ def _make_machines(models: list[Model], start: np.ndarray, count: int, timing: T
 class _ThreadRunner:
     """Runs `machine_step.run_machines` by threads, each with its own work space."""
 
-    def __init__(self, model: Model, stacked: Model, task: Task, threads: int) -> None:
+    def __init__(self, model: Model, code: MechanismCode, task: Task, threads: int) -> None:
         self._threads = threads or len(os.sched_getaffinity(0))
-        code = trace_mechanism(model, stacked)
         self._lanes = [make_lanes(model, code, LANES) for _ in range(self._threads)]
         self._pool = ThreadPoolExecutor(self._threads) if self._threads > 1 else None
         self._function = make_batch_function(code, task)

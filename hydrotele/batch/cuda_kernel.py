@@ -14,7 +14,7 @@ import numpy as np
 
 from hydrotele.batch import machine_step
 from hydrotele.batch.machine_step import NO_TASK, Lanes, Machines, Noise, Task, Timing
-from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, trace_mechanism
+from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode
 from hydrotele.core.compiled import cache_folder, source_digest
 from hydrotele.core.device import import_cuda, is_simulated, make_device_function
 from hydrotele.core.output import atomic_file
@@ -43,16 +43,16 @@ class Kernels(NamedTuple):
     source: np.ndarray
 
 
-def make_cuda_kernels(model: Model, stacked: Model, task: Task, terms: Sequence[Term]) -> Kernels:
+def make_cuda_kernels(model: Model, code: MechanismCode, task: Task, terms: Sequence[Term]) -> Kernels:
     """Return the CUDA kernels for machines with the structure of a model.
 
     Args:
         model: Model of one machine; the sizes of its work space are constants of the kernels.
-        stacked: Model whose parameters have a leading dimension for the machines.
+        code: its traced mechanism.
         task: the task, `machine_step.NO_TASK` for none.
         terms: terms of the machine.
     """
-    code, replaced = trace_mechanism(model, stacked), {}
+    replaced: dict[Any, Any] = {}
     lanes = machine_step.make_lanes(model, code, 1)
     replaced |= make_law_functions(terms, lambda function: make_device_function(function, replaced))
     for name in PROGRAMS:
@@ -165,10 +165,10 @@ def _local_array(name: str, values: np.ndarray) -> list[str]:
 class CudaRunner:
     """Runs the kernel of a batch on the present CUDA device."""
 
-    def __init__(self, model: Model, stacked: Model, task: Any, terms: Sequence[Term]) -> None:
+    def __init__(self, model: Model, code: MechanismCode, task: Any, terms: Sequence[Term]) -> None:
         """Make the kernel; it is compiled on its first launch."""
         self._cuda = import_cuda()
-        self._kernels = make_cuda_kernels(model, stacked, task, terms)
+        self._kernels = make_cuda_kernels(model, code, task, terms)
         self._source = self._copy_to_device(self._kernels.source)
         self._element_kernels: dict[Any, Any] = {}
 

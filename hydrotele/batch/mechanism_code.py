@@ -36,6 +36,7 @@ ARRAYS = (
 )  # fmt: skip
 """Arrays of the programs: state, arrays of `Space` and `ReducedMotion`, largest closure residual [m], parameters,
 and (length of the step, half the length of the kick) [s]."""
+_SINGLE_ARRAYS = ("mass", "force")  # positions, closed chains and transmissions, which set flows, stay in float64
 PROGRAMS = ("move", "correct", "place", "pose")
 """Names of the programs of `MechanismCode`."""
 STEP, HALF_KICK = range(2)  # rows of `step`
@@ -63,14 +64,15 @@ class MechanismCode(NamedTuple):
     has_closures: bool
 
 
-def trace_mechanism(model: Model, stacked: Model) -> MechanismCode:
+def trace_mechanism(model: Model, stacked: Model, precision: str = "double") -> MechanismCode:
     """Trace the mechanism of a model.
 
     Args:
         model: Model of one machine.
         stacked: Model whose parameters have a leading dimension for the machines.
+        precision: "double", or "mixed" to compute mass matrix and forces in float32.
     """
-    tracer = _Tracer(model, stacked)
+    tracer = _Tracer(model, stacked, _SINGLE_ARRAYS if precision == "mixed" else ())
     return MechanismCode(
         tracer.trace_move(), tracer.trace_correct(), tracer.trace_place(False), tracer.trace_place(True),
         np.array(list(tracer.parameters), np.int64).reshape(-1, 3), len(model.mech.dependent) > 0,
@@ -90,7 +92,8 @@ def array_shapes(model: Model) -> dict[str, tuple[int, ...]]:
 class _Tracer:
     """Makes the symbolic arrays of the programs; the parameters are shared by all programs."""
 
-    def __init__(self, model: Model, stacked: Model) -> None:
+    def __init__(self, model: Model, stacked: Model, single: tuple[str, ...]) -> None:
+        self._single = [ARRAYS.index(name) for name in single]
         self.model, self.shapes = model, array_shapes(model)
         self.parameters: dict[tuple[int, int, int], int] = {}
         self._stacked, self._functions = stacked.mech, {}
@@ -101,7 +104,7 @@ class _Tracer:
     def _begin(self) -> tuple[Program, Any, Space, dict[str, Any]]:
         """Return a new program with its model, work space and arrays of loaded values."""
         sizes = [max(1, int(np.prod(self.shapes[name]))) if name in self.shapes else 0 for name in ARRAYS]
-        program, mech = Program(sizes), self.model.mech
+        program, mech = Program(sizes, self._single), self.model.mech
         loaded = {name: symbolic_array(program, k, self.shapes[name]) for k, name in enumerate(ARRAYS) if sizes[k]}
         space = model_space(self.model)
         used = {name: array.copy() for name, array in loaded.items()}

@@ -32,10 +32,12 @@ class Program:
         stores: (array's index, element's index, value or float) in order.
         sizes: number of elements of each array per machine; 0 for an array whose elements are vectors of
             all machines.
+        single: indices of arrays whose elements are computed in float32 where no other array needs the operation.
     """
 
-    def __init__(self, sizes: Sequence[int]) -> None:
+    def __init__(self, sizes: Sequence[int], single: Sequence[int] = ()) -> None:
         """Create an empty program for arrays with these numbers of elements per machine."""
+        self.single = tuple(single)
         self.operations: list[tuple] = []
         self.stores: list[tuple[int, int, Any]] = []
         self.sizes = tuple(sizes)
@@ -60,9 +62,10 @@ class Program:
         """Write a value to an element of an array at the end of the program."""
         self.stores.append((array, element, value))
 
-    def used_operations(self) -> list[int]:
-        """Return the numbers of the operations on which stored values depend, in order."""
-        used, open_ones = set(), [v.number for _, _, v in self.stores if isinstance(v, Value)]
+    def used_operations(self, excluded: Sequence[int] = ()) -> list[int]:
+        """Return the numbers of the operations on which values stored in all but some arrays depend, in order."""
+        used = set()
+        open_ones = [v.number for array, _, v in self.stores if isinstance(v, Value) and array not in excluded]
         while open_ones:
             number = open_ones.pop()
             if number not in used:
@@ -70,10 +73,15 @@ class Program:
                 open_ones += [a.number for a in self.operations[number][1:] if isinstance(a, Value)]
         return sorted(used)
 
+    def single_operations(self) -> set[int]:
+        """Return the numbers of the operations that are done in float32: sums, products and quotients."""
+        wide = set(self.used_operations(self.single))
+        return {n for n, (name, *_) in enumerate(self.operations) if n not in wide and name in _SYMBOLS}
+
     @property
     def digest(self) -> str:
         """Hash of the program, 16 hexadecimal digits."""
-        text = repr((self.sizes, [self._describe(n) for n in self.used_operations()], self.stores))
+        text = repr((self.sizes, self.single, [self._describe(n) for n in self.used_operations()], self.stores))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def _describe(self, number: int) -> tuple:
@@ -82,12 +90,21 @@ class Program:
     def python_source(self, name: str, arrays: Sequence[str]) -> str:
         """Return the source of a Python function of a tuple of arrays, for one machine.
 
-        `math` is a global variable. The arrays are contiguous, or have one element per row.
+        `math` and `single`, which rounds to float32, are global variables. The arrays are contiguous, or have one
+        element per row.
         """
+        rounded = self.single_operations()
+
+        def word(given: Any, is_single: bool) -> str:
+            text = f"v{given.number}" if isinstance(given, Value) else repr(float(given))
+            if isinstance(given, Value) and is_single == (given.number in rounded):
+                return text
+            return f"{'single' if is_single else 'float'}({text})"
+
         lines = [f"def {name}(arrays):", f"    {', '.join(arrays)} = [array.reshape(-1) for array in arrays]"]
         for number in self.used_operations():
             kind, *given = self.operations[number]
-            words = [f"v{a.number}" if isinstance(a, Value) else repr(float(a)) for a in given]
+            words = [word(a, number in rounded) for a in given]
             if kind == "load":
                 text = f"{arrays[given[0]]}[{given[1]}]"
             elif kind in _SYMBOLS:
@@ -98,8 +115,7 @@ class Program:
                 text = f"math.{kind}({words[0]})"
             lines.append(f"    v{number} = {text}")
         for array, element, value in self.stores:
-            text = f"v{value.number}" if isinstance(value, Value) else repr(float(value))
-            lines.append(f"    {arrays[array]}[{element}] = {text}")
+            lines.append(f"    {arrays[array]}[{element}] = {word(value, False)}")
         return "\n".join(lines) + "\n"
 
     def emit(self, builder: Any, address: Callable[[int, int, int], Any], lanes: int, call: Callable) -> None:
@@ -112,11 +128,12 @@ class Program:
             lanes: number of machines, one per element of a vector; 1 for scalars.
             call: emits the call of a function of one number, given its name and the argument.
         """
-        real = ir.DoubleType()
+        real, small = ir.DoubleType(), ir.FloatType()
         kind = ir.VectorType(real, lanes) if lanes > 1 else real
+        small_kind = ir.VectorType(small, lanes) if lanes > 1 else small
 
-        def constant(number: float) -> Any:
-            return ir.Constant(kind, [number] * lanes if lanes > 1 else number)
+        def constant(number: float, of_kind: Any) -> Any:
+            return ir.Constant(of_kind, [number] * lanes if lanes > 1 else number)
 
         def elements(value: Any) -> list[Any]:
             if lanes == 1:
@@ -138,9 +155,19 @@ class Program:
             return join([builder.load(address(array, element, lane)) for lane in range(lanes)])
 
         values: dict[int, Any] = {}
+        converted: dict[int, Any] = {}
+        rounded = self.single_operations()
 
-        def operand(given: Any) -> Any:
-            return values[given.number] if isinstance(given, Value) else constant(float(given))
+        def operand(given: Any, is_single: bool = False) -> Any:
+            if not isinstance(given, Value):
+                number = float(np.float32(given)) if is_single else float(given)
+                return constant(number, small_kind if is_single else kind)
+            if is_single == (given.number in rounded):
+                return values[given.number]
+            if given.number not in converted:
+                convert, of_kind = (builder.fptrunc, small_kind) if is_single else (builder.fpext, kind)
+                converted[given.number] = convert(values[given.number], of_kind)
+            return converted[given.number]
 
         arithmetic = {"add": builder.fadd, "sub": builder.fsub, "mul": builder.fmul, "div": builder.fdiv}
         for number in self.used_operations():
@@ -148,7 +175,8 @@ class Program:
             if name == "load":
                 values[number] = read(*given)
             elif name in arithmetic:
-                values[number] = arithmetic[name](operand(given[0]), operand(given[1]))
+                is_single = number in rounded
+                values[number] = arithmetic[name](operand(given[0], is_single), operand(given[1], is_single))
             elif name == "keep_below":
                 is_below = builder.fcmp_ordered("<", operand(given[0]), operand(given[1]))
                 values[number] = builder.select(is_below, operand(given[2]), operand(given[3]))
@@ -333,7 +361,7 @@ def make_device_program(program: Program, arrays: Sequence[str]) -> Any:
     """
     cuda = import_cuda()
     if is_simulated():
-        scope: dict[str, Any] = {"math": math}
+        scope: dict[str, Any] = {"math": math, "single": np.float32}
         exec(program.python_source("run_program", arrays), scope)
         return cuda.jit(device=True)(scope["run_program"])
     extending = import_module("numba.cuda.extending")

@@ -24,9 +24,12 @@ class DeviceCore(ReducedCore):
 
     is_on_device = True
 
-    def __init__(self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0) -> None:
+    def __init__(
+        self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0,
+        precision: str | None = None,
+    ) -> None:  # fmt: skip
         """Make the machines and the kernels; the arguments are those of `ReducedCore`."""
-        super().__init__(task, options, count, threads, autoreset, device="cuda")
+        super().__init__(task, options, count, threads, autoreset, "cuda", precision)
         if self.batch.count != count:
             raise InputError("num_envs", f"must be at least {self.batch.count}, the number of variants")
 

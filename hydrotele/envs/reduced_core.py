@@ -61,8 +61,9 @@ class ReducedCore(TaskCore):
     """
 
     def __init__(
-        self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0, device: str = "cpu"
-    ) -> None:
+        self, task: Task, options: Options, count: int = 1, threads: int = 1, autoreset: int = 0, device: str = "cpu",
+        precision: str | None = None,
+    ) -> None:  # fmt: skip
         """Make the machines and allocate the arrays.
 
         Args:
@@ -72,6 +73,7 @@ class ReducedCore(TaskCore):
             threads: number of threads; 0 for one per core.
             autoreset: when an episode that ended is restarted: NEXT_STEP, SAME_STEP or DISABLED.
             device: "cpu" or "cuda".
+            precision: option of `Batch`; None for the default of the device.
 
         Raises:
             InputError: the task needs contact, an option is not valid, or there is no CUDA device.
@@ -97,6 +99,7 @@ class ReducedCore(TaskCore):
         self.batch = Batch(
             machines, rows, device=device, period=self.setup.clock.period, timestep=options.timestep, threads=threads,
             task=BatchTask(self._functions.before, self._functions.after, arrays), channels=channels, start=starts,
+            **({} if precision is None else {"precision": precision}),
         )  # fmt: skip
         self._varied = [name for name in _VARIED if len(getattr(arrays, name)) > 1]
         self.count, self._is_started = int(count), np.zeros(count, bool)

@@ -79,7 +79,7 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
     Args:
         task: name of the task, or another argument of `find_task`.
         choices: fields of `envs.task.Options`, and `device`: None for MuJoCo, "cpu" or "cuda" for the
-            reduced model.
+            reduced model; then also `precision`, see `batch.Batch`.
         count: number of environments.
         threads: number of threads that step the environments, 0 for one per core.
         autoreset: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
@@ -91,6 +91,7 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
         InputError: the task or an option does not exist, or a value is not valid.
     """
     found, choices = find_task(task), dict(choices)
+    precision = choices.pop("precision", None)
     if (device := choices.pop("device", None)) not in (None, "cpu", "cuda"):
         raise InputError("environment option 'device'", f"must be cpu or cuda, for the reduced model, not {device!r}")
     known = {field.name for field in dataclasses.fields(Options)}
@@ -102,10 +103,12 @@ def make_task_core(task: Any, choices: dict[str, Any], count: int, threads: int,
         from hydrotele.envs.reduced_core import ReducedCore  # loads the tracing of mechanisms
 
         if device == "cpu":
-            return ReducedCore(found, options, count, threads, autoreset)
+            return ReducedCore(found, options, count, threads, autoreset, precision=precision)
         from hydrotele.envs.device_core import DeviceCore
 
-        return DeviceCore(found, options, count, threads, autoreset)
+        return DeviceCore(found, options, count, threads, autoreset, precision)
+    if precision is not None:
+        raise InputError("environment option 'precision'", "needs the option device")
     step_or_reset_simulation.compile_in_background(
         _COMPILE_LOOPS_COMMAND
     )  # while the plant's own code is compiled here

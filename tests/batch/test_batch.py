@@ -186,6 +186,7 @@ def test_options_and_sensors_that_do_not_exist_are_named(cat215):
 
 
 SIMULATED = """
+import sys
 import numpy as np
 from hydrotele.batch import Batch
 from hydrotele.machine.machine_file import load_machine
@@ -194,7 +195,10 @@ noisy = SensorSet(angle=Sensor(standard_deviation=1e-3), pressure=Sensor(accurac
 from hydrotele.terms.term import Term
 drag = Term(name="drag", axis="boom", balance="force", law="quadratic_drag", parameters={"coefficient": 2e5})
 machine = load_machine("cat215", "bucket").model_copy(update={"terms": (drag,)})
-cpu, cuda = (Batch(machine, 2, device=d, period=0.003, sensors=noisy, rate_limit=100.0) for d in ("cpu", "cuda"))
+cpu, cuda = (
+    Batch(machine, 2, device=d, period=0.003, sensors=noisy, rate_limit=100.0, precision=sys.argv[1])
+    for d in ("cpu", "cuda")
+)
 for command in np.random.default_rng(0).uniform(-0.5, 0.5, (2, 2, 4)):
     shown, same = cpu.step(command), cuda.step(command)
     assert np.array_equal(cpu.state, cuda.state.copy_to_host())
@@ -207,10 +211,27 @@ print("equal")
 """
 
 
-def test_the_cuda_kernel_has_the_bits_of_the_cpu_in_numbas_simulator():
+def test_mixed_precision_keeps_the_accuracy_required_of_the_batch(machine=("cat215", "bucket")):
+    """Required are 0.02 deg and 28 kPa RMS over 10 s; the rounding of mass matrix and forces takes a thousandth."""
+    double, mixed = (Batch(load_machine(*machine), 4, precision=p) for p in ("double", "mixed"))
+    differences = []
+    for command in np.repeat(random_commands(20, 4), 25, axis=0):
+        double.step(command)
+        mixed.step(command)
+        differences.append(np.abs(mixed.state - double.state))
+    names = np.array(double.state_names)
+    worst, rms = np.max(differences, axis=(0, 1)), np.sqrt(np.mean(np.square(differences), axis=(0, 1)))
+    assert 0.0 < worst[np.char.startswith(names, "position")].max() < np.radians(0.02) / 1000
+    assert rms[np.char.startswith(names, "pressure")].max() < 28.0
+    with pytest.raises(InputError, match="double or mixed"):
+        Batch(load_machine(*machine), 1, precision="half")
+
+
+@pytest.mark.parametrize("precision", ["double", "mixed"])
+def test_the_cuda_kernel_has_the_bits_of_the_cpu_in_numbas_simulator(precision):
     """The Python code of the kernel and of the traced programs rounds as the CPU's machine code."""
     environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
     done = subprocess.run(
-        [sys.executable, "-c", SIMULATED], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", SIMULATED, precision], env=environment, capture_output=True, text=True, check=False
     )
     assert done.stdout.strip() == "equal", done.stderr[-2000:]

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import hydrotele.envs
 task, action = sys.argv[1:]
-options = dict(duration=0.06, variants=2, sensors="real", autoreset_mode="SameStep", action=action)
+options = dict(duration=0.06, variants=2, sensors="real", autoreset_mode="SameStep", action=action, precision="mixed")
 cpu, cuda = (gymnasium.make_vec(f"hydrotele/{task}-v0", 2, device=d, **options) for d in ("cpu", "cuda"))
 def are_equal(one, two):
     return all(np.array_equal(a, b.copy_to_host()) for a, b in zip(one[:-1], two[:-1], strict=True))

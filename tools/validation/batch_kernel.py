@@ -20,6 +20,7 @@ from numba import from_dtype, typeof, types
 from hydrotele.batch.batch import Batch
 from hydrotele.batch.cuda_kernel import make_cuda_kernels, make_element_kernel
 from hydrotele.batch.machine_step import NO_TASK
+from hydrotele.batch.mechanism_code import trace_mechanism
 from hydrotele.core.device import import_cuda
 from hydrotele.envs.episode import NEXT_STEP
 from hydrotele.envs.task_catalogue import make_task_core
@@ -65,9 +66,10 @@ def compile_to_ptx(kernel: Any, *arguments: Any) -> tuple[str, float]:
     return ptx, round(time.process_time() - begin, 1)
 
 
-def compile_kernels(batch: Batch) -> dict[str, dict[str, Any]]:
+def compile_kernels(batch: Batch, precision: str) -> dict[str, dict[str, Any]]:
     """Compile the kernels that advance a batch; return their figures by name."""
-    kernels = make_cuda_kernels(batch._single, batch.model, batch.task, batch.machine.terms)
+    code = trace_mechanism(batch._single, batch.model, precision)
+    kernels = make_cuda_kernels(batch._single, code, batch.task, batch.machine.terms)
     found = {}
     for name in ("step", "before", "after"):
         if (kernel := getattr(kernels, name)) is not None:
@@ -91,15 +93,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tool", default="bucket", help="tool of the cat215")
     parser.add_argument("--task", help="environment, such as TrackTrajectory, instead of the machine alone")
+    parser.add_argument("--precision", choices=["mixed", "double"], default="mixed", help="of mass matrix and forces")
     chosen = parser.parse_args()
     dispatcher = import_module("numba.cuda.dispatcher")
     setattr(dispatcher, "get_current_device", lambda: SimpleNamespace(compute_capability=CAPABILITY))  # noqa: B010
     if chosen.task:
         core: Any = make_task_core(chosen.task, {"device": "cpu"}, 8, 1, NEXT_STEP)
-        kernels = {"begin of episodes": compile_begin(core), **compile_kernels(core.batch)}
+        kernels = {"begin of episodes": compile_begin(core), **compile_kernels(core.batch, chosen.precision)}
     else:
         batch = Batch(load_machine("cat215", chosen.tool), 8, threads=1)
-        kernels = compile_kernels(batch)
+        kernels = compile_kernels(batch, chosen.precision)
     for title, figures in kernels.items():
         print(title)
         for name, value in figures.items():
