@@ -40,6 +40,7 @@ from hydrotele.gap.result import Gap, Method, finite, gap_document, in_customary
 from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
 from hydrotele.logs.dataset import Dataset
+from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, save_machine
 from hydrotele.simulate.actuator_callbacks import stop_profiling_clock
 from hydrotele.simulate.open_loop_prediction import open_loop_errors
@@ -92,17 +93,46 @@ def gap_to_folder(
     stop_profiling_clock()
     model = load_machine_for_logs(data, machine, tool)
     dataset = load_dataset_without_contact(data, model, sensors, heldout, force, contact, mask)
-    with keep_interim_answer(target) as keep:
-        gap = _run_search(dataset, effects, jobs, method, as_json, keep)
+    with keep_interim_answer(target) as interim:
+        gap = _run_search(dataset, effects, jobs, method, as_json, interim.keep)
+        interim.finish(gap)
         with atomic_folder(target, "gap") as folder:
             write_gap_files(gap, dataset, folder, recording, data)
     print_result(gap_document(gap), as_json, lambda: _print(gap), target)
     return target
 
 
+class InterimFolder:
+    """The folder `TARGET.interim` of a search.
+
+    Attributes:
+        path: the folder.
+        content: names of its files, empty before the first answer.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Store the path; the folder is written with the first answer."""
+        self.path, self.content = path, ""
+
+    def keep(self, answer: Interim) -> None:
+        """Write the best answer so far: `interim.json` and the corrected machine, `machine.yaml`."""
+        self._write("interim.json", answer.document, answer.machine)
+
+    def finish(self, gap: Gap) -> None:
+        """Write the result of the search, `gap.json` and `machine.yaml`, before report and recording are made."""
+        self._write("gap.json", gap_document(gap), gap.patched)
+
+    def _write(self, name: str, document: dict, machine: Machine) -> None:
+        with atomic_folder(self.path, "interim gap") as folder:
+            write_json(folder / name, document)
+            save_machine(machine, folder / MACHINE_FILE)
+            write_json(folder / "summary.json", {"kind": "interim gap", "hydrotele": hydrotele.__version__})
+        self.content = f"{name} and {MACHINE_FILE}"
+
+
 @contextlib.contextmanager
-def keep_interim_answer(target: Path) -> Iterator[Callable[[Interim], None]]:
-    """Let a search store its best answer so far in the folder `TARGET.interim`; delete it after success.
+def keep_interim_answer(target: Path) -> Iterator[InterimFolder]:
+    """Let a search store its answers in the folder `TARGET.interim`; delete it after success.
 
     If the context ends with an error or with Ctrl-C, the folder stays and its path is printed on
     stderr.
@@ -111,29 +141,20 @@ def keep_interim_answer(target: Path) -> Iterator[Callable[[Interim], None]]:
         target: final output folder of the search.
 
     Yields:
-        A function that writes an answer: `interim.json` and the corrected machine, `machine.yaml`.
+        The folder.
 
     Raises:
         InputError: the interim folder cannot be written.
     """
     place = target.with_name(f"{target.name}.interim")
     check_output_folder(place, "interim gap")
-    written = []
-
-    def write(answer: Interim) -> None:
-        with atomic_folder(place, "interim gap") as folder:
-            write_json(folder / "interim.json", answer.document)
-            save_machine(answer.machine, folder / MACHINE_FILE)
-            write_json(folder / "summary.json", {"kind": "interim gap", "hydrotele": hydrotele.__version__})
-        written.append(place)
-
+    interim = InterimFolder(place)
     try:
-        yield write
+        yield interim
     except BaseException:
-        if written:
+        if interim.content:
             stderr_console.print(
-                f"The search did not end; its best answer so far is in {place}: interim.json and {MACHINE_FILE}.",
-                soft_wrap=True,
+                f"The command did not end; its best answer so far is in {place}: {interim.content}.", soft_wrap=True
             )
         raise
     shutil.rmtree(place, ignore_errors=True)

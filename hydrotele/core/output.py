@@ -26,7 +26,7 @@ OUTPUT_FILES = {
         "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
         "posterior.parquet", "posterior/machine.*", "posterior/machine_assets/*",
     ),
-    "interim gap": ("interim.json", "machine.*", "machine_assets/*"),
+    "interim gap": ("gap.json", "interim.json", "machine.*", "machine_assets/*"),
     "compare": ("compare.json", "*.png"),
     "contact": ("contact.json", "mask.csv", "*.parquet"),
     "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",

@@ -30,6 +30,7 @@ _MAX_DISTANCE_RATIO = 0.75  # of the median step of a group: between 0.5, in a f
 _MAX_SPARSE_FRACTION = 0.5  # of the rows of a group: a column with values in fewer rows has separate times
 _MAX_STEP_BACK = 1.0  # [s] of stamps: longer than any delay by which messages overtake each other
 _HELD_KINDS = ("command", "valid", "reference")
+_KEPT_METADATA = ("machine", "tool", "sensors")
 
 
 @dataclass
@@ -95,7 +96,8 @@ def import_log(
         columns: mapping of the columns, see `machine.log_columns`. Columns that are named like a
             channel need no entry.
         commands: command channel -> range of its column, as for `load_log`.
-        metadata: metadata of the log, in addition to the version of hydrotele.
+        metadata: metadata of the log, in addition to the version of hydrotele and to machine, tool and sensors
+            that the recordings state.
 
     Returns:
         (log, report).
@@ -134,7 +136,8 @@ def import_log(
         values[0] = np.rint((main.time - main.time[0]) * 1e9) / 1e9
         start = datetime.datetime.fromtimestamp(origin / 1e9 + main.time[0], datetime.UTC)
         report.notes.append(f"time 0 is {start.isoformat(timespec='milliseconds')}.")
-    known = {"hydrotele": hydrotele.__version__, **(metadata or {})}
+    kept = {k: v for recording in reversed(recordings) for k, v in recording.metadata.items() if k in _KEPT_METADATA}
+    known = {**kept, "hydrotele": hydrotele.__version__, **(metadata or {})}
     table = Table(", ".join(map(str, paths)), names, values, units, known)
     log = make_log(normalise_commands(convert_mask_column(table), commands or {}))
     report.notes += log.notes

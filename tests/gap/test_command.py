@@ -140,6 +140,10 @@ def test_an_interrupted_search_keeps_its_best_answer_and_says_where(site, search
     assert json.loads((site / "here.interim" / "interim.json").read_text()) == answer.document
     assert load_machine(site / "here.interim").links["payload"].mass == 250.0
     monkeypatch.setitem(sys.modules["hydrotele.gap.find"].__dict__, "find_gap", whole)
+    with monkeypatch.context() as report:
+        report.setattr("hydrotele.cli.gap_command.write_gap_files", lambda *_: (_ for _ in ()).throw(stop))
+        assert invoke("gap", "--data", "site", "--no-recording", "--out", "here")[0] != 0
+    assert json.loads((site / "here.interim" / "gap.json").read_text())["verdict"] == "named"
     assert invoke("gap", "--data", "site", "--no-recording", "--out", "here")[0] == 0
     assert names(site) == ["here", "site"], "a search that ends leaves no interim answer"
 

@@ -297,13 +297,15 @@ def test_exported_messages_are_those_of_ros(tmp_path):
 
 def test_commands(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("a.csv").write_text("Time;Boom angle [deg]\n" + "".join(f"{t};{b}\n" for t, b in zip(TIME, BOOM, strict=True)))
+    head = "# sensors: khoshzaban1992\nTime;Boom angle [deg]\n"
+    Path("a.csv").write_text(head + "".join(f"{t};{b}\n" for t, b in zip(TIME, BOOM, strict=True)))
     run = CliRunner()
     assert run.invoke(app, ["import", "a.csv", "--write-mapping", "m.yaml"]).exit_code == 0
     assert isinstance(run.invoke(app, ["import", "a.csv", "--write-mapping", "m.yaml"]).exception, InputError)
     done = run.invoke(app, ["import", "a.csv", "--mapping", "m.yaml", "--machine", "cat215", "--json"])
     assert done.exit_code == 0 and '"channel": "angle.boom"' in done.stdout
-    assert pq.read_schema("a.parquet").metadata[b"machine"] == b"cat215"
+    known = pq.read_schema("a.parquet").metadata
+    assert known[b"machine"] == b"cat215" and known[b"sensors"] == b"khoshzaban1992"
     assert np.allclose(load_log("a.parquet")["angle.boom"], np.radians(BOOM))
     assert run.invoke(app, ["export-log", "a.parquet", "--mcap", "a.mcap"]).exit_code == 0
     before = Path("a.parquet").read_bytes()
