@@ -63,12 +63,12 @@ class Effect:
     Attributes:
         name: fixed name, used in reports and files.
         description: short description of the effect.
-        model_part: the law of the model that it changes.
+        model_part: the part of the model that it changes.
         locations: function machine -> names of the possible locations.
         parameters: function (machine, location) -> parameter name -> Parameter.
         apply: function (machine, location, parameter name -> value) -> machine with the effect.
             With nominal values the returned machine behaves like the given one.
-        mechanism: common name of effects that are different forms of one mechanism, such as the
+        mechanism: common name of effects that describe one physical cause in different forms, such as the
             delay and the lag of one sensor; empty if there is no other form.
 
     Examples:

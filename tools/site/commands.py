@@ -23,7 +23,7 @@ def find_commands() -> dict[str, Any]:
 
 def format_command(command: Any, words: str, level: int = 1) -> list[str]:
     """Return the parts of the text on a command and its subcommands; `words` is the command as it is typed."""
-    parts = [f"{'#' * level} {words}", *_paragraphs(command.help or ""), " ".join(TEXTS.get(words, "").split())]
+    parts = [f"{'#' * level} {words}", *_paragraphs(command.help or ""), *_paragraphs(TEXTS.get(words, ""))]
     commands = getattr(command, "commands", {})
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option" and not p.hidden]

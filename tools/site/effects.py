@@ -83,7 +83,7 @@ def format_page(effect: Effect) -> str:
         _link_names(setting["similar"], effect.name),
         ""
         if not effect.mechanism or not forms
-        else f"{_links(forms)} and {effect.name} are forms of one mechanism, that is, different laws of the same"
+        else f"{_links(forms)} and {effect.name} are forms of one effect, that is, different laws of the same"
         " physical cause. The verdict of `hydrotele gap` adds their probabilities.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
