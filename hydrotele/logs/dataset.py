@@ -196,6 +196,7 @@ _MAX_PIECES = 3  # maximum number of fit pieces of a single run
 _HELD_OUT_FRACTIONS = 0.15, 0.6  # fraction of a divided run that the held-out piece should have
 _FIT_FRACTION = 0.75  # fraction of a single run to fit
 _MIN_HELD_OUT_CHANGE = 0.1  # minimum fraction of the command changes that the held-out part must contain
+_MIN_HELD_OUT_COMMAND = 0.1  # of the RMS command of the fitted runs, below which an axis counts as resting
 _MIN_FIT_FRACTION = 0.5  # minimum fraction of a single run to fit
 _HELD_OUT_PREFIXES = ("test", "heldout", "validation")
 
@@ -347,11 +348,10 @@ def describe_resting_axes(split: Split, axes: Sequence[str]) -> tuple[str, ...]:
     """
 
     def activity(parts: Sequence[RunPart]) -> np.ndarray:
-        changes = [np.nansum(np.abs(np.diff(part.rows.command, axis=0)), axis=0) for part in parts]
-        return np.sum(changes, axis=0) / sum(run_duration(part.rows) for part in parts)
+        return np.sqrt(np.nanmean(np.concatenate([part.rows.command for part in parts]) ** 2, axis=0))
 
     fitted, held_out = activity(split.fit), activity([split.heldout])
-    idle = [axis for axis, a, b in zip(axes, fitted, held_out, strict=True) if b < _MIN_HELD_OUT_CHANGE * a]
+    idle = [axis for axis, a, b in zip(axes, fitted, held_out, strict=True) if b < _MIN_HELD_OUT_COMMAND * a]
     if not idle:
         return ()
     return (

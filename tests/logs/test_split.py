@@ -36,6 +36,7 @@ def test_a_held_out_part_that_rests_on_an_axis_is_noted():
     """The axes move one after another, so that the last quarter moves the second one only."""
     t = np.linspace(0.0, 1.0, 4000)
     both = np.column_stack([np.sin(60.0 * t) * (t < 0.7), np.sin(60.0 * t) * (t > 0.6)])
+    both += np.random.default_rng(0).uniform(-0.08, 0.08, both.shape)  # noise of a joystick
     alike = np.column_stack([np.sin(60.0 * t), np.cos(60.0 * t)])
     notes = [describe_resting_axes(split_runs({"run": rows(x)}, {"run": "run"}, None)[0], ("boom", "stick"))
              for x in (both, alike)]  # fmt: skip
