@@ -96,10 +96,11 @@ class ReducedCore(TaskCore):
         models = [reduced_model(machine, channels) for machine in machines]
         starts, *measured = make_start_states(self.setup, machines, models)
         arrays = self._make_episode_arrays(machines, models, *measured)
+        chosen: dict[str, Any] = {} if precision is None else {"precision": precision}
         self.batch = Batch(
             machines, rows, device=device, period=self.setup.clock.period, timestep=options.timestep, threads=threads,
             task=BatchTask(self._functions.before, self._functions.after, arrays), channels=channels, start=starts,
-            **({} if precision is None else {"precision": precision}),
+            **chosen,
         )  # fmt: skip
         self._varied = [name for name in _VARIED if len(getattr(arrays, name)) > 1]
         self.count, self._is_started = int(count), np.zeros(count, bool)

@@ -44,7 +44,7 @@ class Drive:
     def __init__(self, target: Path, **changes):
         self.target, self.port, self.error = target, free_port(), None
         usual = DriveOptions(
-            None, {}, "keyboard", target, True, 120.0, 1.0, False, True, web=("127.0.0.1", self.port)
+            None, {}, "keyboard", target, True, 1200.0, 1.0, False, True, web=("127.0.0.1", self.port)
         )  # fmt: skip
         self._options = usual._replace(**changes)
         self._thread = threading.Thread(target=self._run)
