@@ -179,7 +179,8 @@ def test_keys_joysticks_and_gamepad_move_the_handle(open_page):
 def test_second_page_watches_and_a_closed_page_leaves_the_machine_without_commands(open_page):
     first, second = open_page(), open_page()
     start(first)
-    second.wait_for_function("status.role === 'watcher' && document.querySelector('#note').innerText.includes('watches')")
+    second.wait_for_function("status.role === 'watcher'")
+    second.wait_for_function("document.querySelector('#note').innerText.includes('only watches')")
     assert second.is_disabled("#run")
     second.keyboard.down("KeyI")
     row = second.evaluate("new Promise(done => setTimeout(() => done(status.rows[0][1]), 800))")
