@@ -17,6 +17,7 @@ from hydrotele.batch.machine_step import NO_TASK, Lanes, Machines, Noise, Task, 
 from hydrotele.batch.mechanism_code import ARRAYS, PROGRAMS, MechanismCode
 from hydrotele.core.compiled import cache_folder, source_digest
 from hydrotele.core.device import import_cuda, is_simulated, make_device_function
+from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
 from hydrotele.core.tracing import make_device_program
 from hydrotele.estimate.reduced_model import Model
@@ -166,8 +167,14 @@ class CudaRunner:
     """Runs the kernel of a batch on the present CUDA device."""
 
     def __init__(self, model: Model, code: MechanismCode, task: Any, terms: Sequence[Term]) -> None:
-        """Make the kernel; it is compiled on its first launch."""
+        """Make the kernels; they are compiled on their first launch.
+
+        Raises:
+            InputError: there is no CUDA device.
+        """
         self._cuda = import_cuda()
+        if not self._cuda.is_available():
+            raise InputError("device cuda", "there is no CUDA device or driver on this computer: use device cpu")
         self._kernels = make_cuda_kernels(model, code, task, terms)
         self._source = self._copy_to_device(self._kernels.source)
         self._element_kernels: dict[Any, Any] = {}

@@ -13,6 +13,7 @@ from hydrotele.batch.batch import Task
 from hydrotele.batch.machine_step import restart_machine
 from hydrotele.batch.measure import compare_with_log
 from hydrotele.core.compiled import compile_without_allocation
+from hydrotele.core.device import import_cuda
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.estimate.reduced_model import model_space, predicted_channels, reduced_model, simulate_rows
@@ -180,6 +181,9 @@ def test_options_and_sensors_that_do_not_exist_are_named(cat215):
         Batch(cat215, 1, period=0.0205)
     with pytest.raises(InputError, match="has no option thread"):
         Batch(cat215, 1, thread=1)
+    if not import_cuda().is_available():
+        with pytest.raises(InputError, match="no CUDA device"):
+            Batch(cat215, 1, device="cuda")
     late = cat215.model_copy(update={"sensor_errors": {"angle.boom": SensorError(delay=0.01)}})
     with pytest.raises(InputError, match="delay of sensors angle.boom"):
         Batch(late, 1)
