@@ -140,7 +140,9 @@ def handle_is_centred(page):
 
 
 def handle_is_raised(page):
-    page.wait_for_function("parseFloat(status.rows[0][1].split(' z ')[1]) > 3")
+    """Wait for the handle; a page that was too slow to send and lost its machine starts again."""
+    again = "status.role === 'free' ? (document.querySelector('#run').click(), false)"
+    page.wait_for_function(f"{again} : parseFloat(status.rows[0][1].split(' z ')[1]) > 3", polling=500)
 
 
 @needs_chromium
