@@ -104,7 +104,7 @@ def _compile_gap() -> None:
             save_log(run_scenario(scenario).measured, Path(folder) / f"{k}.parquet")
         data = load_dataset(Path(folder), load_machine("cat215"))
         find_gap(data)
-        find_gap(data, effects=("valve_gain",), method="regression")
+        find_gap(data, effects=("valve_gain",))
     fit_robust(np.arange(9.0), np.ones((9, 1)), np.array([-np.inf]))  # these logs are too short for it
 
 

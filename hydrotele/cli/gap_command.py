@@ -36,7 +36,7 @@ from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.interim import Interim
 from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
 from hydrotele.gap.posterior import write_posterior
-from hydrotele.gap.result import Gap, Method, finite, gap_document, in_customary_units
+from hydrotele.gap.result import Gap, finite, gap_document, in_customary_units
 from hydrotele.identify.joint_motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
 from hydrotele.logs.dataset import Dataset
@@ -56,7 +56,7 @@ def gap_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
     sensors: str | None, target: Path | None, as_json: bool, recording: bool,
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
-    mask: Path | None = None, method: Method = "search", contact: ContactOption = "mask",
+    mask: Path | None = None, contact: ContactOption = "mask",
 ) -> Path:  # fmt: skip
     """Find the effects that explain the differences (gap) between a machine model and its logs.
 
@@ -76,7 +76,6 @@ def gap_to_folder(
         jobs: number of processes, None for 2.
         force: accept logs whose metadata name another machine or tool.
         mask: CSV file of masked intervals, which are not used.
-        method: how effects are searched, `search` or `regression`.
         contact: `mask` to mask intervals of detected contact and loads, `ignore` to use all rows.
 
     Returns:
@@ -94,7 +93,7 @@ def gap_to_folder(
     model = load_machine_for_logs(data, machine, tool)
     dataset = load_dataset_without_contact(data, model, sensors, heldout, force, contact, mask)
     with keep_interim_answer(target) as interim:
-        gap = _run_search(dataset, effects, jobs, method, as_json, interim.keep)
+        gap = _run_search(dataset, effects, jobs, as_json, interim.keep)
         interim.finish(gap)
         with atomic_folder(target, "gap") as folder:
             write_gap_files(gap, dataset, folder, recording, data)
@@ -349,14 +348,14 @@ def compute_open_loop_errors(
 
 
 def _run_search(
-    dataset: Dataset, effects: Sequence[str], jobs: int | None, method: Method, quiet: bool,
+    dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool,
     keep: Callable[[Interim], None],
 ) -> Gap:  # fmt: skip
     from hydrotele.gap.find import find_gap
 
     with show_stages(f"gap {dataset.machine.name}", quiet) as progress:
         return find_gap(
-            dataset, progress, effects=tuple(effects), jobs=jobs or 2, method=method, keep=keep,
+            dataset, progress, effects=tuple(effects), jobs=jobs or 2, keep=keep,
             warn=lambda text: stderr_console.print(f"[yellow]check the logs:[/] {text}", soft_wrap=True),
         )  # fmt: skip
 

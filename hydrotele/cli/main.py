@@ -404,10 +404,6 @@ def gap(
     contact: ContactChoice = "mask",
     force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write a recording for `hydrotele review`.")] = True,
-    method: Annotated[
-        Literal["search", "regression"],
-        typer.Option(help="Method for hydraulic machines: search (default), or regression, which is experimental."),
-    ] = "search",
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -429,7 +425,7 @@ def gap(
         return
     gap_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, recording,
-        effect or [], jobs, force, mask, method, contact,
+        effect or [], jobs, force, mask, contact,
     )  # fmt: skip
 
 

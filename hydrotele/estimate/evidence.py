@@ -418,10 +418,6 @@ class Evidence:
         found[np.ix_(own, own)] = information[np.ix_(there, there)]
         return found
 
-    def keep_information(self, guess: Guess, slopes: np.ndarray) -> None:
-        """Keep what slopes (E, P) tell of a guess: a base of its numbers needs no rough ones."""
-        self._information = guess.names, slopes.T @ slopes + np.eye(slopes.shape[1])
-
     def _along(
         self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float, own: Sequence[int]
     ) -> np.ndarray:  # fmt: skip

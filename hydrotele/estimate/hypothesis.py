@@ -294,16 +294,6 @@ def _reach(hypothesis: Hypothesis, machine: Machine, index: int, end: float) -> 
     return inside
 
 
-def with_shape(hypothesis: Hypothesis, machine: Machine) -> Hypothesis | None:
-    """A library effect with its optional numbers, too, which come last; None if it has no more."""
-    known = EFFECTS.get(hypothesis.name)
-    if known is None or hypothesis.change:
-        return None
-    table = known.parameters(machine, hypothesis.location)
-    more = {key: p for key, p in table.items() if key not in hypothesis.parameters}
-    return replace(hypothesis, parameters={**hypothesis.parameters, **more}) if more else None
-
-
 @dataclass(frozen=True)
 class Guess:
     """Hypotheses taken together, each at a deviation (p,)."""

@@ -900,18 +900,3 @@ def rippled(levels: Levels) -> bool:
 def rippled_at(levels: Levels, state: str, times: float = _RIPPLE) -> bool:
     """Whether a state's white process noise, as of `rate.swing`, is more than an integrator's."""
     return levels.drift.get(state, 0.0) > times * DRIFT[state.partition(".")[0]]
-
-
-def input_excess(track: Track) -> float:
-    """Twice the log likelihood that a track's unknown inputs bring, all else the same."""
-    if not track.levels.inputs:
-        return 0.0
-    names, m = list(track.names), len(track.levels.inputs)
-    run = linear_run(track, track.unknown_command_variances)
-    drift = track.process_variances
-    noise = row_variances(track.levels, track.run)
-    loss = smooth(run, noise, drift).loss
-    drift[len(names) - m :] = 0.0
-    initial = run.initial.copy()
-    initial[len(names) - m :] = 0.0
-    return smooth(run._replace(initial=initial), noise, drift).loss - loss

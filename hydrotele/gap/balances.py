@@ -44,11 +44,7 @@ from hydrotele.hydraulics.pump_drive import load_cylinder_force, load_pressure_s
 from hydrotele.hydraulics.supply import (
     DEMAND,
     FEED,
-    LINE_DROOP,
-    LINE_FLOW,
     SCRATCH_SIZE,
-    drawn_flow,
-    max_supply_pressure,
     write_delivered_fractions,
 )
 from hydrotele.identify import optimal_smoother
@@ -202,36 +198,6 @@ def supply_pressures(user, spools, pressures, period):
     for k in range(rows):
         _solve_row(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
         out[:, k] = ports[FEED : FEED + count]
-    return out
-
-
-@compiled
-def pump_lacks(user, spools, pressures, supply, period, begin):
-    """Flow that a pump which is short gives beyond what it should.
-
-    Args:
-        user: (h * SLOTS,) numbers of the h valves.
-        spools: (h, n) [1].
-        pressures: (h, 2, n) head and rod pressures [Pa].
-        supply: (n,) pressure of the pump [Pa].
-        period: as of `supply_pressures`.
-        begin: index of the first valve of the pump.
-
-    Returns:
-        (2, n): what the valves draw at that pressure less the pump's flow [m^3/s], and by how much
-        the pressure is below that of a pump that is not short [Pa].
-
-    Source: nominal model, "Supply".
-    """
-    count, rows = spools.shape
-    ports, out = np.zeros(SCRATCH_SIZE), np.empty((2, rows))
-    size = group_size(user, 0, count, begin)
-    act = np.zeros(4 * count + int(user[_MEMORY]))
-    for k in range(rows):
-        _solve_row(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
-        drawn = drawn_flow(user, begin, size, ports[4 * begin :], supply[k], ports[LINE_DROOP + begin])
-        out[0, k] = drawn - ports[LINE_FLOW + begin]
-        out[1, k] = max_supply_pressure(user, begin, size, ports[4 * begin :]) - supply[k]
     return out
 
 
@@ -452,8 +418,6 @@ def peak_lag(expected: np.ndarray, measured: np.ndarray, period: float) -> float
 BAND = 1.5
 _AVERAGE = 1.0  # s: the draws' scatter is averaged over it
 _SUPPLY = "supply"
-_HALF = 0.5  # of a margin: a load that swings takes up some of it
-_NOT_SHORT = 0.02  # of its setting: a relief valve, and its reading, hold it no better
 
 
 @dataclass(frozen=True)
@@ -503,43 +467,6 @@ def run_balances(machine: Machine, data: Dataset, run: RunData, noise: np.ndarra
     return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
 
 
-def pump_lack(
-    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray, name: str = "supply"
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flow that a pump of valves gives beyond the model's, where it is short.
-
-    Read off the supply's balance, row by row: a filter whose model has the pump at its relief
-    setting cannot tell that its flow is short, as more or less of it would change nothing.
-
-    Args:
-        machine: the model.
-        data: the dataset.
-        run: one of its runs.
-        noise: as of `run_balances`.
-        name: name of the pump.
-
-    Returns:
-        ((n,) flow [m^3/s], (n,) its standard deviation): NaN where the pressure is within
-        `_NOT_SHORT` or half a load-sensing margin of a pump's that is not short, and everywhere if
-        a channel is missing.
-    """
-    signals = _signals(machine, data, run, noise)
-    unknown = np.full((2, len(run.command)), np.nan)
-    parts = _supply_signals(machine, signals, name)
-    if parts is None or len(signals.time) != unknown.shape[1]:
-        return unknown[0], unknown[1]
-    user, spools, pressures, supplies = parts
-    found = np.stack([
-        pump_lacks(user, spools, p, supply, signals.period, _first_valve(machine, name))
-        for p, supply in zip(pressures, supplies, strict=True)
-    ])  # fmt: skip
-    flow, below = found[:, 0], found[0, 1]
-    pump = machine.pumps[name]
-    margin = pump.load_sensing_margin if pump.kind == "load_sensing" else 0.0
-    short = below > np.maximum(_NOT_SHORT * (below + supplies[0]), _HALF * margin)
-    return np.where(short, flow[0], np.nan), _scatter(flow, signals.period)
-
-
 def _signals(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -> Signals:
     columns = {f"command.{axis}": v for axis, v in zip(data.axes, run.command.T, strict=True)}
     columns |= dict(zip(data.channels, run.reading.T, strict=True))
@@ -548,32 +475,6 @@ def _signals(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -
     each = noise if run.readings_per_mean is None else noise / np.sqrt(run.readings_per_mean)
     known = dict(zip(data.channels, each.tolist(), strict=True))
     return read_signals(machine, log, data.sensors, known)
-
-
-def balances(
-    machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None
-) -> dict[str, dict[str, Balance]]:
-    """Balances of all laws that a log's channels allow.
-
-    `closure`: measured cylinder length minus that from the measured angle. `force`: force of the
-    pressures (or of a plain drive's command) minus what the smoothed motion needs, below `BAND`.
-    `flow_head`, `flow_rod`: oil that a chamber lacks, below `BAND`. `supply`: measured supply
-    pressure minus that from spools and chamber pressures. `timing`: by how much the motion comes
-    later than the flow of the valve says.
-
-    Args:
-        machine: the model.
-        log: one run of the machine.
-        sensors: name of the machine's sensors; None to find their noise from the data.
-        noise: channel -> standard deviation of one reading, in place of the sensors'.
-
-    Returns:
-        Law -> axis (or "supply", "supply.<pump>") -> Balance; what lacks a channel is absent.
-
-    Raises:
-        InputError: the time stamps follow no clock, or the machine has no such sensors.
-    """
-    return _balances(machine, read_signals(machine, log, sensors, noise))
 
 
 def _balances(machine: Machine, signals: Signals) -> dict[str, dict[str, Balance]]:

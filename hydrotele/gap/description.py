@@ -11,8 +11,7 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.filter import SUPPLY, Input, input_units
 from hydrotele.gap.answer import base_effect
-from hydrotele.gap.discover import Discovery, Learned
-from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Memory
+from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Learned, Memory
 from hydrotele.gap.result import (
     LIKELY,
     SURE,
@@ -516,21 +515,16 @@ _UNITS = {"time": "s", "spool": "1", "pump_speed": "rad/s", "command": "1",
 
 
 def learned_laws(
-    discovery: Discovery, machine: Machine, shares: Mapping[tuple[str, str], float]
+    laws: Sequence[Learned], machine: Machine, shares: Mapping[tuple[str, str], float]
 ) -> tuple[LearnedLaw, ...]:
-    """The learned laws of a guess as curves, formulas and sentences.
+    """Return learned laws as curves, formulas and sentences.
 
     Args:
-        discovery: the guess with its laws.
+        laws: the laws.
         machine: the given model.
-        shares: part of the guess -> share of the gap that it closes.
-
-    Returns:
-        The laws in the order of the guess.
+        shares: name and location -> share of the gap that it closes.
     """
-    laws = {law.hypothesis.key: law for law in discovery.laws}
-    keys = [h.key for h in discovery.judged.guess.hypotheses if h.key in laws]
-    return tuple(_learned_law(machine, laws[key], shares[key]) for key in keys)
+    return tuple(_learned_law(machine, law, shares[law.hypothesis.key]) for law in laws)
 
 
 def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:

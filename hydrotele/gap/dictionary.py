@@ -14,8 +14,8 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.track import COARSE, Track
-from hydrotele.gap.discover import Seen
 from hydrotele.gap.laws import LawForm
+from hydrotele.gap.run_variables import Seen
 
 AMPLITUDES = (0.3, 2.0, -2.0)
 """Parameter changes [prior standard deviations] at which columns are formed. The large ones are for effects with one

@@ -13,10 +13,10 @@ from hydrotele.estimate.filter import MEMORY, _rows_later, input_sizes, input_un
 from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED
 from hydrotele.estimate.reduced_model import model_space, reduced_model, state_names
 from hydrotele.estimate.track import COARSE, Track, steps_per_row
-from hydrotele.gap.discover import see
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR
 from hydrotele.gap.result import Comparison, Contender, InputTrace, NamedEffect, Rejection
-from hydrotele.gap.rivals import ENTER, part_taken
-from hydrotele.gap.search import Found
+from hydrotele.gap.rivals import Found, part_taken
+from hydrotele.gap.run_variables import see
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 
@@ -60,42 +60,32 @@ def compare_contenders(found: Found, named: Sequence[NamedEffect]) -> tuple[Comp
 def list_rejections(
     found: Found,
     named: Sequence[NamedEffect],
-    details: Sequence[NamedEffect],
-    minor_share: float,
     worse: Sequence[str],
-    min_score: float = ENTER,
 ) -> tuple[Rejection, ...]:
     """List what was tried and not named, with the test that it failed.
 
     Args:
         found: the search.
         named: the named effects.
-        details: effects that close too little of the gap.
-        minor_share: fraction of the gap up to which an effect counts as a detail.
         worse: sentences on changes that made the held-out run worse.
-        min_score: twice the log Bayes factor above which the search accepts an effect.
 
     Returns:
         The rejections, the most plausible first.
     """
     rejections = []
-    kept = {(e.name, e.location) for e in (*named, *details)}
+    kept = {(e.name, e.location) for e in named}
     for (hypothesis, _), rest in zip(found.guess.parts, found.without, strict=True):
         if rest is not None and hypothesis.key not in kept and not hypothesis.name.startswith(LEARNED):
             taken = part_taken(rest, found.judged)
             test = "fraction of the residual inputs' loss that it removes"
             rejections.append(Rejection(*hypothesis.key, test, taken, math.nan))
-    rejections += [Rejection(e.name, e.location, "fraction of the gap closed", e.share, minor_share) for e in details]
-    if found.weak:
-        hypothesis, deviation = found.weak.guess.parts[-1]
-        size = float(np.max(np.abs(deviation) / hypothesis.least))
-        test = "parameter change, relative to the smallest relevant change"
-        rejections.append(Rejection(*hypothesis.key, test, size, 1.0))
     known = {h.key for h in found.guess.hypotheses} | {(r.name, r.location) for r in rejections}
     if not found.guess.parts:
         for s in found.ranking[:3]:
-            if s.hypothesis.key not in known and s.score < min_score:
-                rejections.append(Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, min_score))
+            if s.hypothesis.key not in known and s.factor < MIN_LOG_BAYES_FACTOR:
+                rejections.append(
+                    Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.factor, MIN_LOG_BAYES_FACTOR)
+                )
     rejections += [Rejection("", "", sentence, math.nan, math.nan) for sentence in worse]
     return tuple(rejections)
 

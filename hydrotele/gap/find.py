@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,22 +20,18 @@ from hydrotele.gap.balances import run_balances
 from hydrotele.gap.calibrating import (
     FreeCalibration,
     calibrate_freely,
-    fit_until_settled,
 )
 from hydrotele.gap.description import describe, effect_title, learned_laws
-from hydrotele.gap.discover import Discovery, Learned, OpenLoop, better_ahead, discover, open_loop, relearned
 from hydrotele.gap.experiment import next_experiment
 from hydrotele.gap.explanation import compare_contenders, list_rejections, trace_inputs
-from hydrotele.gap.heldout import HeldOut, compare_heldout
+from hydrotele.gap.heldout import compare_heldout
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
 from hydrotele.gap.laws import learned_of, with_profile
 from hydrotele.gap.machine_model import MachineModel
-from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
+from hydrotele.gap.model_search import search_model
 from hydrotele.gap.posterior import Posterior, sample_posterior
 from hydrotele.gap.residuals import (
-    believed,
-    believed_part,
     constancy,
     has_sizes,
     left_over,
@@ -44,7 +40,6 @@ from hydrotele.gap.residuals import (
     rms,
 )
 from hydrotele.gap.result import (
-    LIKELY,
     SURE,
     Alternative,
     Candidate,
@@ -53,13 +48,12 @@ from hydrotele.gap.result import (
     GapSize,
     Lack,
     LearnedLaw,
-    Method,
     NamedEffect,
     Prediction,
     Verdict,
     VerdictExplanation,
 )
-from hydrotele.gap.rivals import ENTER, TOLD, effect_probabilities, part_taken
+from hydrotele.gap.rivals import TOLD, Found, effect_probabilities
 from hydrotele.gap.run_differences import (
     NUISANCE,
     between_run_differences,
@@ -67,31 +61,12 @@ from hydrotele.gap.run_differences import (
     list_quantities,
     widen_to_new_run,
 )
-from hydrotele.gap.search import Found, lacking, search
-from hydrotele.gap.verdict import compare_held_out, count_unexplained
-from hydrotele.gap.verdict import verdict_of as verdict_of_regression
+from hydrotele.gap.verdict import compare_held_out, count_unexplained, verdict_of
 from hydrotele.logs.dataset import Dataset, RunData, exchange_heldout
 from hydrotele.logs.dataset_reduction import downsample, select_exciting_segments
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
 
-PARTLY = 0.3  # share of the gap that named effects must close for the verdict `partly`
-_TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
-_WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
-_REJECTED = (
-    "The changes found on the fitted runs increase the errors on {} held-out run; they were"
-    " rejected, and no effect is named."
-)
-_REFUSED = (
-    "A law learned from the fitted runs increases the errors of open-loop predictions of the"
-    " held-out run; it was rejected."
-)
-_MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
-# machine than 15 % of what they do
-_OF_LAWS = 0.1  # of what a guess explains, by laws beside effects, from which laws are tried alone
-_MOST_OF_IT = 0.9  # of what is lacking: an effect that takes more is no part of a law's work
-_TRACE_OF_FORM = 0.01  # share up to which an effect only mends the form of one beside it, which
-# may be a tenth of what that one does off
 _WORTH_TELLING = 0.005  # probability below which an alternative is left out
 _ALIKE = 1.0e-3  # of the squares of what an effect changes: readings that are alike to 3 %
 _NORMAL95 = 1.96
@@ -111,7 +86,6 @@ def find_gap(
     effects: Sequence[str] = (),
     jobs: int = 2,
     keep: Callable[[Interim], None] | None = None,
-    method: Method = "search",
     warn: Callable[[str], None] = lambda text: None,
     *,
     may_exchange: bool = True,
@@ -125,9 +99,8 @@ def find_gap(
             open-loop predictions calibrate nothing, because the cause may be an effect that was not tested.
         jobs: number of processes.
         keep: called with the best answer so far, each time that there is a better one.
-        method: `search`, or `regression` of `gap.model_search`.
         warn: called with one sentence per gross error of the logs, before the search.
-        may_exchange: whether the regression may hold out another run, if the held-out run shows an effect that the
+        may_exchange: whether the search may hold out another run, if the held-out run shows an effect that the
             fitted runs do not show and do not contradict.
 
     Returns:
@@ -159,7 +132,6 @@ def find_gap(
         ...     print(effect.name, effect.location, f"{found.value:.0f} +- {0.5 * (found.high - found.low):.0f} N")
         coulomb_friction slide 594 +- 8 N
     """
-    is_regression = method == "regression"
     begin = time.perf_counter()
     report = progress or (lambda text, share: None)
     logged, given, notes = data, data.machine, []
@@ -177,8 +149,7 @@ def find_gap(
     initial = run_initial_regressions(data)
     for gross in initial.errors:
         warn(gross.description)
-    if is_regression:
-        candidates = with_start_values(candidates, initial)
+    candidates = with_start_values(candidates, initial)
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     interim = keep_better(data.machine, keep, begin) if keep else lambda judged: None
     leader = ""
@@ -193,110 +164,65 @@ def find_gap(
 
     evidence.keep = keep_best
     try:
-        if is_regression:
-            found = search_model(MachineModel(evidence), candidates, tell, has_laws=not effects)
-        else:
-            found = search(evidence, candidates, tell)
-        discovery, held_out, own = Discovery(found.judged, ()), None, HeldOut(found, {}, ())
-        if is_regression:
-            tell("compare the held-out run with the fitted runs", 0.92)
-            own = compare_heldout(evidence, found, candidates)
-            found = own.found
-            if own.is_open and may_exchange:
-                report("hold out another run", 0.0)
-                return find_gap(exchange_heldout(logged), progress, effects, jobs, keep, method, may_exchange=False)
-        if is_regression and found.guess.parts:
+        found = search_model(MachineModel(evidence), candidates, tell, has_laws=not effects)
+        tell("compare the held-out run with the fitted runs", 0.92)
+        own = compare_heldout(evidence, found, candidates)
+        found = own.found
+        if own.is_open and may_exchange:
+            report("hold out another run", 0.0)
+            return find_gap(exchange_heldout(logged), progress, effects, jobs, keep, warn, may_exchange=False)
+        held_out = None
+        if found.guess.parts:
             tell("compare with the given machine on the held-out run", 0.94)
             held_out = compare_held_out(evidence, found.base, found.judged)
             if held_out.is_worse:
                 notes.append(held_out.words)
                 found = found.emptied()
                 keep_best(evidence.set_base(found.base))
-        if is_regression:
-            discovery = Discovery(found.judged, ())
-        elif lacking(found.judged, evidence) > 0.0 and not effects:
-            if worse := _worse_held_out(evidence, found.judged, opened, jobs):
-                notes.append(_REJECTED.format(worse))
-                found = found.emptied()
-                keep_best(evidence.set_base(found.base))
-            tell("learn laws of the unexplained difference", 0.93)
-            found, discovery = _learned(evidence, found)
-            evidence.keep(discovery.judged)
-            if discovery.refused:
-                notes.append(_REFUSED)
         tell("evaluate on the held-out run", 0.96)
-        outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
-        if outcome.worse and not is_regression:
-            if (note := _REJECTED.format(outcome.worse)) not in notes:
-                notes.append(note)
-            misleading, found = bool(found.guess.parts), found.emptied()
-            discovery = Discovery(found.base, ())
-            if misleading and not effects:
-                tell("learn laws of the given machine", 0.96)
-                evidence.set_base(found.base)
-                discovery = discover(evidence, found.base, found.base.tracks[0].levels.noise)
-            outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
-            if outcome.worse:
-                discovery = Discovery(found.base, ())
-                outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
+        outcome = _Outcome.of(evidence, found.judged, given)
         nominal, patched, judge = data.machine, outcome.patched, outcome.judge
         before, after = outcome.asked, outcome.after
-        tests, floor = judge.tests(evidence, discovery.judged, after)
-        # Numbers of effects were found before the laws, and so were their intervals.
-        told = found.judged if discovery.laws else discovery.judged
-        evidence.set_base(told)
+        tests, floor = judge.tests(evidence, found.judged, after)
+        evidence.set_base(found.judged)
         scatter = tests.get("constancy", {}).get("value", 1.0)
-        covariance = posterior_covariance(evidence, told.guess, scatter)
-        varied: dict[tuple[str, str], Learned] = {}
-        if is_regression:
-            laws = learned_of(evidence, told, covariance)
-            discovery = dataclasses.replace(discovery, laws=tuple(law for law in laws if not law.form_of))
-            varied = {law.hypothesis.key: law for law in laws if law.form_of}
+        covariance = posterior_covariance(evidence, found.guess, scatter)
+        laws = learned_of(evidence, found.judged, covariance)
         spread = np.sqrt(np.diag(covariance))
-        differences = (*between_run_differences(told.guess, covariance, own.spread), *own.differences)
-        method_notes = [difference_words(d) for d in differences]
-        method_notes += [
+        differences = (*between_run_differences(found.guess, covariance, own.spread), *own.differences)
+        notes += [difference_words(d) for d in differences]
+        notes += [
             f"{h.name} of {h.location} acts in {', '.join(h.runs)}; the corrected machine does not contain it."
-            for h in told.guess.hypotheses if h.runs and h.name not in NUISANCE
+            for h in found.guess.hypotheses if h.runs and h.name not in NUISANCE
         ]  # fmt: skip
-        shares = judge.shares(discovery, before, after, floor, evidence.map)
-        traces = trace_inputs(evidence.data, found.base, discovery.judged)
+        shares = judge.shares(found.guess, before, after, floor, evidence.map)
+        traces = trace_inputs(evidence.data, found.base, found.judged)
     finally:
         evidence.close()
-    learned = learned_laws(discovery, nominal, shares)
-    named = _named(found, discovery.judged.guess, spread, shares, not is_regression)
+    learned = learned_laws([law for law in laws if not law.form_of], nominal, shares)
+    profiles = {law.hypothesis.key: law for law in laws if law.form_of}
+    named = _named(found, spread, shares)
+    named = tuple(with_profile(data.machine, e, profiles.get((e.name, e.location))) for e in named)
     left = left_over(before[0], after[0], data.channels, floor)
-    details = ()
+    named = count_unexplained(named, learned, left, _lost(tests, learned))
     size = GapSize(rms(before[:1]), rms(after[:1]), floor)
-    unbounded = dataclasses.replace(size, noise_floor=None)  # process noise may stand for what is missing
-    if is_regression:
-        failed = any(not test["passed"] for test in tests.values())
-        failed |= held_out is not None and held_out.is_worse  # a gap of the fitted runs remains
-        named = tuple(
-            with_profile(data.machine, effect, varied.get((effect.name, effect.location))) for effect in named
-        )
-        named = count_unexplained(named, learned, left, _lost(tests, learned, 0.0))
-        verdict = verdict_of_regression(named, learned, failed, unbounded if judge.ripple else size)
-        method_notes += [words for effect in named if (words := answer_words(effect))]
-        if held_out and not held_out.is_worse:
-            method_notes.append(held_out.words)
-    else:
-        failed = _failed(tests, rms(before[:1]), rms(after[:1]), floor)
-        failed |= any(law.share > _MINOR for law in learned)  # a law that has no known cause
-        if failed:
-            named = believed(named, learned, left, _lost(tests, learned, _MINOR))
-        perfect = not (failed or learned or _lacks(data.machine, discovery.judged))
-        named, details = without_details(named, failed, data.machine.axes, perfect)
-        verdict = verdict_of(named, failed, None if judge.ripple else floor)
-    lacks = _lacks(data.machine, discovery.judged)
+    # process noise may stand for what is missing
+    bounded = dataclasses.replace(size, noise_floor=None) if judge.ripple else size
+    is_worse = held_out is not None and held_out.is_worse  # a gap of the fitted runs remains
+    failed = is_worse or any(not test["passed"] for test in tests.values())
+    verdict = verdict_of(named, learned, failed, bounded)
+    notes += [words for effect in named if (words := answer_words(effect))]
+    if held_out and not is_worse:
+        notes.append(held_out.words)
+    lacks = _lacks(data.machine, found.judged)
     predictions = tuple(_prediction(t, data) for t in before)
     improved = tuple(_prediction(t, data) for t in after)
     unknown = None
     if failed or learned:
-        unknown = describe(_lacks(data.machine, found.judged), learned, improved)
+        unknown = describe(lacks, learned, improved)
     laws, units = _laws(dataclasses.replace(data, machine=given), patched, judge.levels.noise)
     tell("done", 1.0)
-    calibration = _calibration(discovery.judged.guess, spread)
+    calibration = _calibration(found.guess, spread)
     if opened:  # what free runs left uncertain was the search's prior, not the machine's
         patched = with_value(patched, "uncertainty", given.uncertainty)
     jitter = _jitter(data, judge.levels)
@@ -304,9 +230,7 @@ def find_gap(
         patched = with_value(patched, f"sensors.{data.sensors}.jitter", jitter[0])
     posterior = None
     if named or calibration or opened or differences:
-        fits = widen_to_new_run(
-            discovery.judged.guess, covariance, data.machine, list_quantities(data.machine, candidates)
-        )
+        fits = widen_to_new_run(found.guess, covariance, data.machine, list_quantities(data.machine, candidates))
         posterior = _sample_posterior(data, given, opened, fits, judge.levels)
     return Gap(
         machine=given,
@@ -317,8 +241,8 @@ def find_gap(
         size=size,
         ranking=tuple(
             Candidate(
-                s.hypothesis.name, s.hypothesis.location, s.gain, s.gain - s.score,
-                s.hypothesis.values(s.start), {key: p.unit for key, p in s.hypothesis.parameters.items()},
+                s.hypothesis.name, s.hypothesis.location, s.factor,
+                s.hypothesis.values(s.deviation), {key: p.unit for key, p in s.hypothesis.parameters.items()},
             )
             for s in found.ranking[:15]
         ),
@@ -333,17 +257,13 @@ def find_gap(
         lacks=lacks,
         noise=_noise(data, judge.levels),
         jitter=jitter,
-        notes=(*data.notes, *notes, *map(detail_words, details), *method_notes,
-               *_notes(found, data, judge.levels, floor)),
+        notes=(*data.notes, *notes, *_notes(found, data, judge.levels, floor)),
         unused_channels=data.unused_channels,
         answers=tuple(answer_document(named)),
         initial=initial,
         explanation=VerdictExplanation(
             compare_contenders(found, named),
-            list_rejections(
-                found, named, details, _MINOR, [n for n in notes if "rejected" in n],
-                MIN_LOG_BAYES_FACTOR if is_regression else ENTER,
-            ),
+            list_rejections(found, named, [n for n in notes if "rejected" in n]),
             traces,
         ),
         posterior=posterior,
@@ -421,8 +341,7 @@ class _Judge:
         return tests, floor if holds else None
 
     def shares(
-        self, discovery: Discovery, before: Sequence[Track], after: Sequence[Track],
-        floor: float | None, each: Callable,
+        self, guess: Guess, before: Sequence[Track], after: Sequence[Track], floor: float | None, each: Callable,
     ) -> dict[tuple[str, str], float]:  # fmt: skip
         """Part -> share of the held-out run's gap that comes back without it.
 
@@ -437,264 +356,59 @@ class _Judge:
             whole, back = then - (floor or 1.0) ** 2, rms(without) ** 2 - now
             return float(np.clip(back / whole, 0.0, 1.0)) if whole > 0 else 0.0
 
-        guess = discovery.judged.guess
         found = each(share, range(len(guess.parts)))
         return {h.key: s for h, s in zip(guess.hypotheses, found, strict=True)}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Outcome:
-    """What a patched machine makes of the runs, the held-out one first.
+    """Predictions of the given and of the corrected machine for all runs, the held-out one first.
 
     Attributes:
         judge: with the noise that was found.
-        patched: the machine.
+        patched: the corrected machine.
         asked: tracks of the machine that the user gave.
-        after: of the patched one.
-        worse: in what the held-out run is worse than that of the machine that the search began
-            with, as `_REJECTED` says it; empty if it is not.
+        after: of the corrected one.
     """
 
     judge: _Judge
     patched: Machine
     asked: tuple[Track, ...]
     after: tuple[Track, ...]
-    worse: str
 
     @classmethod
-    def of(
-        cls, evidence: Evidence, discovery: Discovery, opened: FreeCalibration | None,
-        given: Machine, jobs: int,
-    ) -> "_Outcome":  # fmt: skip
-        """What a guess and its laws make of them; `opened` where free runs calibrated `given`."""
-        data, judge = evidence.data, _Judge(evidence.data, discovery.judged)
-        nominal, patched = data.machine, discovery.judged.guess.machine(data.machine)
-        models = [nominal, *([discovery.judged.guess] if discovery.judged.guess.parts else [])]
-        before, *others = judge.tracks(models + ([given] if opened else []), evidence.map)
-        asked = others.pop() if opened else before
-        after = others[0] if others else before
-        worse = _worse(data, patched, before, after, opened, jobs)
-        return cls(judge, patched, asked, after, worse)
+    def of(cls, evidence: Evidence, judged: Judged, given: Machine) -> "_Outcome":
+        """Predict the runs with the given machine and with a fitted model."""
+        data, judge = evidence.data, _Judge(evidence.data, judged)
+        models = [given, judged.guess] if judged.guess.parts or given is not data.machine else [given]
+        tracks = judge.tracks(models, evidence.map)
+        return cls(judge, judged.guess.machine(data.machine), tracks[0], tracks[-1])
 
 
-def _worse(
-    data: Dataset, patched: Machine, before: Sequence[Track], after: Sequence[Track],
-    opened: FreeCalibration | None, jobs: int,
-) -> str:  # fmt: skip
-    """In what a patched machine is worse on the first run, the held-out one; empty if it is not."""
-    if opened and patched is not data.machine and opened.undone_by(data, patched, jobs):
-        return "open-loop predictions of the"
-    return "" if rms(after[:1]) <= _WORSE * rms(before[:1]) else "the"
-
-
-def _worse_held_out(evidence: Evidence, judged: Judged, opened: FreeCalibration | None, jobs: int) -> str:
-    """In what a guess is worse on the held-out run than the given machine; empty if it is not."""
-    if not judged.guess.parts:
-        return ""
-    data, patched = evidence.data, judged.guess.machine(evidence.data.machine)
-    judge = _Judge(data, judged)
-    before, after = judge.tracks([data.machine, judged.guess], evidence.map, (data.heldout,))
-    return _worse(data, patched, before, after, opened, jobs)
-
-
-def _failed(tests: Mapping, before: float, after: float, floor: float | None) -> bool:
-    """Whether what is left is more than noise.
-
-    A patch that closes nearly all of a gap may leave a trace of it that a test just sees.
-    """
-    excess = max((test["value"] / test["limit"] for test in tests.values()), default=0.0)
-    if floor is None or excess <= 1.0:
-        return excess > 1.0
-    closed = (before**2 - after**2) / max(before**2 - floor**2, 1e-9)
-    return not (excess < _TRACE and closed > _NEARLY_ALL)
-
-
-def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw], least: float) -> set[str]:
-    """Axes in whose channels something is lacking still, "" for a channel without axis.
-
-    Laws count that close more than the share `least`.
-    """
-    channels = [t["channel"] for name, t in tests.items()
-                if not t["passed"] and name != "constancy"]  # fmt: skip
+def _lost(tests: Mapping[str, dict], laws: Sequence[LearnedLaw]) -> set[str]:
+    """Axes in whose channels something remains or a law was learned; "" for a channel without axis."""
+    channels = [t["channel"] for name, t in tests.items() if not t["passed"] and name != "constancy"]
     axes = {parse_channel(channel).axis or "" for channel in channels}
-    return axes | {law.axis for law in laws if law.share > least}
+    return axes | {law.axis for law in laws if law.share > 0.0}
 
 
-def verdict_of(named: Sequence[NamedEffect], failed: bool, floor: float | None) -> Verdict:
-    """The verdict.
-
-    Args:
-        named: the effects.
-        failed: whether what is left is more than noise.
-        floor: what a perfect model would leave; None where it cannot be told.
-
-    Returns:
-        `no_gap` or `unknown` without effects; `named` where all are sure and nothing is left,
-        `ambiguous` where some are not; `partly` where something is left but the effects close a
-        third of the gap.
-    """
-    sure = [effect for effect in named if effect.mechanism_probability >= SURE]
-    if not named:
-        return "unknown" if failed or floor is None else "no_gap"
-    if not failed:
-        return "named" if len(sure) == len(named) else "ambiguous"
-    closed = sum(effect.share for effect in named if effect.mechanism_probability > LIKELY)
-    return "partly" if closed >= PARTLY else "unknown"
-
-
-def _named(
-    found: Found, last: Guess, spread: np.ndarray, shares: Mapping, has_trust: bool
-) -> tuple[NamedEffect, ...]:  # fmt: skip
-    """Effects of a search, with their numbers in the last guess, which may have learned laws.
-
-    With `has_trust` their probabilities count how much of what was lacking they take.
-    """
+def _named(found: Found, spread: np.ndarray, shares: Mapping) -> tuple[NamedEffect, ...]:
+    """Return the effects of a search, the most probable first."""
     effects, first = [], 0
-    for index, (hypothesis, deviation) in enumerate(last.parts[: len(found.guess.parts)]):
+    fitted = {track.run.name for track in found.judged.tracks}
+    for index, (hypothesis, deviation) in enumerate(found.guess.parts):
         own = spread[first : first + hypothesis.size]
         first += hypothesis.size
         rest = found.without[index]
         if hypothesis.name in NUISANCE or hypothesis.name.startswith(LEARNED) or rest is None:
             continue
         chance, others = _chances(found, index, rest)
-        trust = _trust(found, rest) if has_trust else 1.0
-        chance *= trust
-        fitted = {track.run.name for track in found.judged.tracks}
         estimates = {
             key: estimate for key, estimate in _estimates(hypothesis, deviation, own).items()
             if hypothesis.run_of(key) in fitted | {""}
         }  # fmt: skip
-        others = tuple(dataclasses.replace(a, probability=trust * a.probability) for a in others)
-        effects.append(
-            NamedEffect(
-                hypothesis.name, hypothesis.location, chance,
-                estimates, others, shares[hypothesis.key],
-            )
-        )  # fmt: skip
+        effects.append(NamedEffect(*hypothesis.key, chance, estimates, others, shares[hypothesis.key]))
     return tuple(sorted(effects, key=lambda effect: -effect.probability))
-
-
-def _trust(found: Found, rest: Judged) -> float:
-    """Probability that an effect is the mechanism, by the share that it takes of what is lacking.
-
-    Args:
-        found: the search.
-        rest: its guess without the effect.
-    """
-    return believed_part(part_taken(rest, found.judged))
-
-
-def _learned(evidence: Evidence, found: Found) -> tuple[Found, Discovery]:
-    """Laws of what the effects leave; of all that is lacking, where none of these can be believed.
-
-    Nor can they where laws alone tell the runs as well, unless one of them takes most of what is
-    lacking by itself: what they do is a part of these laws, whose many entries can do what a few
-    numbers do. An effect that takes a small part of a law's work stands in the way of the rest, and
-    nothing takes it back where the law does not act; where free runs do not get better by it
-    either, it is left out.
-    """
-    noise = found.base.tracks[0].levels.noise  # every guess finds other levels
-    if _misled(evidence, found, noise):
-        found = found.emptied()
-        evidence.set_base(found.base)
-    rests = [rest for rest in found.without if rest is not None]
-    if rests and all(_trust(found, rest) < LIKELY for rest in rests):
-        bare = _without_effects(evidence, found)
-        alone = discover(evidence, bare.judged, noise)
-        if alone.laws and alone.judged.loss < found.judged.loss:
-            return bare, alone
-        evidence.set_base(found.judged)
-        beside = discover(evidence, found.judged, noise)
-        return (found, beside) if better_ahead(beside.ahead, alone.ahead) else (bare, alone)
-    beside = discover(evidence, found.judged, noise)
-    fall, whole = found.judged.loss - beside.judged.loss, found.base.loss - beside.judged.loss
-    leading = any(part_taken(rest, found.judged) > _MOST_OF_IT for rest in rests)
-    if rests and not leading and beside.laws and fall > _OF_LAWS * whole:
-        bare = _without_effects(evidence, found)
-        # what effects bring beside laws may be what the form of these misses
-        allowed = sum(found.charges) + _MINOR * whole
-        alone = relearned(evidence, bare.judged, noise, beside.laws)
-        if not alone.stands_for(beside, allowed):
-            alone = discover(evidence, bare.judged, noise)
-        if alone.stands_for(beside, allowed):
-            return bare, alone
-        evidence.set_base(beside.judged)
-    return found, beside
-
-
-def _misled(evidence: Evidence, found: Found, noise: np.ndarray) -> bool:
-    """Whether free runs are clearly better without a calibration and all that is beside it.
-
-    Some sixty numbers can follow from reading to reading what a law does that the model lacks; the
-    machine that they describe then runs away.
-    """
-    if all(h.name != CALIBRATION for h in found.guess.hypotheses):
-        return False
-    bare, own = (open_loop(evidence, evidence.runs, j, noise) for j in (found.base, found.judged))
-    clearly = OpenLoop(*(own_error / _WORSE for own_error in own))
-    return better_ahead(bare, clearly)
-
-
-def _without_effects(evidence: Evidence, found: Found) -> Found:
-    """A search that named nothing, with its calibration, if there is one, fitted again."""
-    place = next((p for p in found.guess.parts if p[0].name == CALIBRATION), None)
-    if place is None:
-        evidence.set_base(found.base)
-        return found.emptied()
-    judged, fit = fit_until_settled(evidence, evidence.judged(Guess((place,))))
-    return dataclasses.replace(found.emptied(), judged=judged, fit=fit, charges=(0.0,), without=(None,), rivals=((),))
-
-
-def without_details(
-    named: Sequence[NamedEffect], lacking: bool, axes: Collection[str], perfect: bool = False
-) -> tuple[tuple[NamedEffect, ...], tuple[NamedEffect, ...]]:
-    """Effects, and those that are details: nothing that these data say of the machine itself.
-
-    What closes next to nothing may only mend the form of an effect of the same axis that closes
-    most, as a trace of presliding does for teeth, or a trace of air in all oil for a hose that
-    swells less the fuller it is; or make up for what is lacking still. Nor does it make what closes
-    most ambiguous if it is rather not there.
-
-    Args:
-        named: the effects, with shares of the gap.
-        lacking: whether the patched machine still lacks something.
-        axes: of the machine; what is located elsewhere, as in all oil, acts on each.
-        perfect: whether not even a trace is lacking, as where a form is wrong: all are effects.
-
-    Returns:
-        The effects, and the details: those that close at most 2 % where something is lacking, or
-        1 % beside such an effect, and those whose 95 % interval holds the given number (of
-        several numbers, which may be known together only, where they close at most 2 %).
-    """
-
-    def meet(effect: NamedEffect, other: NamedEffect) -> bool:
-        places = {one.location.partition(".")[0] for one in (effect, other)}
-        return len(places & set(axes)) < 2
-
-    def detail(effect: NamedEffect) -> bool:
-        likely = effect.mechanism_probability >= LIKELY
-        mends = not perfect and effect.share <= _TRACE_OF_FORM and any(
-            other.share > 0.5 and (meet(effect, other) or not likely)
-            for other in named if other is not effect
-        )  # fmt: skip
-        told = any(not e.low <= e.nominal <= e.high for e in effect.parameters.values())
-        small = effect.share <= _MINOR
-        return (small and lacking) or mends or (not told and (small or len(effect.parameters) == 1))
-
-    details = tuple(effect for effect in named if detail(effect))
-    return tuple(effect for effect in named if effect not in details), details
-
-
-def detail_words(effect: NamedEffect) -> str:
-    """Why an effect is not named although the patched model has it."""
-    told = ", ".join(
-        f"{key} {e.value:.4g} {e.unit} ({e.low:.4g} to {e.high:.4g})" for key, e in effect.parameters.items()
-    )
-    return (
-        f"{effect.name} at {effect.location}, {told}, closes {100 * max(effect.share, 0.0):.1f} %"
-        " of the gap. The patched machine contains it, but it is not named, because it may only"
-        " compensate for other errors of the model."
-    )
 
 
 def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray):
@@ -878,15 +592,5 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
         notes.append(
             "The error of a perfect model is unknown, because the evaluation of runs simulated with"
             " the patched machine failed. The explanation is therefore not reported as complete."
-        )
-    if found.weak:
-        hypothesis, deviation = found.weak.guess.parts[-1]
-        values = hypothesis.values(deviation)
-        told = ", ".join(
-            f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})" for key, p in hypothesis.parameters.items()
-        )
-        notes.append(
-            f"{hypothesis.name} at {hypothesis.location}, {told}, is too small to be named and was"
-            " not added to the model."
         )
     return notes

@@ -24,7 +24,6 @@ from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.gap.answer import answer_document, answer_words
 from hydrotele.gap.description import describe
 from hydrotele.gap.explanation import compare_contenders
-from hydrotele.gap.find import Progress, verdict_of
 from hydrotele.gap.force_columns import SENTENCES, ForceEffect, force_effects
 from hydrotele.gap.force_evidence import NORMAL95, QUANTILES, ForceEvidence, NoiseShape, estimate_noise
 from hydrotele.gap.mechanism_columns import (
@@ -37,7 +36,7 @@ from hydrotele.gap.mechanism_columns import (
     nominal_parameters,
     undone,
 )
-from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, search_model
+from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, Progress, search_model
 from hydrotele.gap.patched import (
     COLUMNS_FILE,
     MJCF_FILE,
@@ -62,9 +61,9 @@ from hydrotele.gap.result import (
     RunDifference,
     VerdictExplanation,
 )
-from hydrotele.gap.rivals import effect_probabilities
+from hydrotele.gap.rivals import Found, effect_probabilities
 from hydrotele.gap.run_differences import difference_words
-from hydrotele.gap.search import Found
+from hydrotele.gap.verdict import verdict_of
 from hydrotele.identify.mechanism import ColumnMapping, Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.multibody.chain import Chain
@@ -234,6 +233,7 @@ def find_force_gap(
         unknown = replace(unknown, depends_on=depends, channel=_channels(task)[task.drives.index(lacks[0].axis)])
     rms = [np.sqrt(np.nanmean(one[0].whitened ** 2, axis=0)) for one in (before, after)]
     total = [float(np.sqrt(np.mean(one**2))) for one in rms]
+    size = GapSize(total[0], total[1], 1.0, METRIC)
     more = [
         f"Forces are compared below {task.band:.3g} Hz.",
         *(_MINOR.format(e.name, e.location, _numbers({k: v.value for k, v in e.parameters.items()})) for e in minor),
@@ -246,8 +246,8 @@ def find_force_gap(
     tell("done", 1.0)
     return Gap(
         machine=given, patched=result.patched,
-        verdict=verdict_of(named, is_rejected or bool(result.is_lacking.any()), 1.0),
-        effects=named, unknown=unknown, size=GapSize(total[0], total[1], 1.0, METRIC), ranking=_ranking(found),
+        verdict=verdict_of(named, (), is_rejected or bool(result.is_lacking.any()), size),
+        effects=named, unknown=unknown, size=size, ranking=_ranking(found),
         before=before, after=after,
         laws={"force": {
             drive: {"before": float(a * std), "after": float(b * std), "noise": float(std)}
@@ -361,7 +361,7 @@ def _given_model(task: _Task) -> tuple[ForceEvidence, Found]:
     columns = build_columns(task.fit, task.mechanism, task.band)
     evidence = _evidence(task, columns, {}, estimate_noise(columns))
     judged = evidence.judge(Guess())
-    return evidence, Found(judged, judged, None, (), (), (), (), None)
+    return evidence, Found(judged, judged, None, (), (), (), ())
 
 
 def interval_of(hypothesis: Hypothesis) -> tuple[float, float] | None:
@@ -678,7 +678,7 @@ def _dependence(evidence: ForceEvidence, result: _Result) -> tuple[str, ...]:
 def _ranking(found: Found) -> tuple[Candidate, ...]:
     return tuple(
         Candidate(
-            *s.hypothesis.key, s.gain, s.gain - s.score, s.hypothesis.values(s.start),
+            *s.hypothesis.key, s.factor, s.hypothesis.values(s.deviation),
             {name: p.unit for name, p in s.hypothesis.parameters.items()},
         )
         for s in found.ranking[:15]
@@ -692,8 +692,8 @@ def _rejections(
     out = [Rejection(e.name, e.location, "probability", e.mechanism_probability, LIKELY) for e in minor]
     if not found.guess.parts:
         out += [
-            Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.score, MIN_LOG_BAYES_FACTOR)
-            for s in found.ranking[:3] if s.score < MIN_LOG_BAYES_FACTOR
+            Rejection(*s.hypothesis.key, "twice the log Bayes factor", s.factor, MIN_LOG_BAYES_FACTOR)
+            for s in found.ranking[:3] if s.factor < MIN_LOG_BAYES_FACTOR
         ]  # fmt: skip
     return (*out, *(Rejection("", "", sentence, np.nan, np.nan) for sentence in untrue))
 

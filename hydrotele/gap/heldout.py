@@ -17,8 +17,8 @@ from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import MIN_LOG_BAYES_FACTOR, Model, add_effects, settle, settle_noise
 from hydrotele.gap.result import RunDifference
+from hydrotele.gap.rivals import Found
 from hydrotele.gap.run_differences import between_runs, difference_in_run, list_quantities
-from hydrotele.gap.search import Found
 
 
 class HeldOut(NamedTuple):

@@ -25,10 +25,10 @@ from hydrotele.estimate.hypothesis import LEARNED, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
 from hydrotele.estimate.track import STEP, Track, error_responses, steps_per_row
 from hydrotele.gap.description import variable_unit
-from hydrotele.gap.discover import Learned, Seen, see_run
-from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Table
+from hydrotele.gap.law_tables import OWN_VARIABLES, THROUGH, Learned, Table
 from hydrotele.gap.regression import compare_groups
 from hydrotele.gap.result import VARIES, Estimate, NamedEffect, Profile
+from hydrotele.gap.run_variables import Seen, see_run
 from hydrotele.logs.dataset import Dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.term import Term
@@ -376,7 +376,7 @@ def learned_of(evidence: Evidence, judged: Judged, covariance: np.ndarray) -> tu
         everywhere = {v: np.concatenate([x[v] for x in runs]) for v in runs[0]}
         found.append(Learned(
             hypothesis, form.balance, form.axis, form.table, root @ deviation,
-            root @ covariance[own, own] @ root.T, 0.0, 0.0, form.smoothing, everywhere, form.effect,
+            root @ covariance[own, own] @ root.T, form.smoothing, everywhere, form.effect,
         ))  # fmt: skip
     return tuple(found)
 

@@ -15,12 +15,12 @@ from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
-from hydrotele.gap.discover import Seen, see_run
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
 from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs, states_after_rows
 from hydrotele.gap.regression import OWN_SCALE, RESIDUAL_SCALES, LevelScale, NormalEquations, reweight_columns
 from hydrotele.gap.run_differences import Quantity, list_quantities, rescale_between_runs
+from hydrotele.gap.run_variables import Seen, see_run
 from hydrotele.machine.machine import Machine
 
 _CORRELATION_ROWS = (2.0, 6.0, 20.0, 60.0)  # correlation times of first-order noise in all channels, in rows of a log

@@ -10,13 +10,14 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 4. Remove every effect whose removal costs less than that; exchange an effect for a better rival.
 """
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hydrotele.estimate.evidence import Fit, Judged, invert_information, occam_penalty
-from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.answer import family_of
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.disturbances import is_pulse
@@ -31,21 +32,22 @@ from hydrotele.gap.regression import (
     sum_equations,
     sum_of_single_effects,
 )
-from hydrotele.gap.result import LIKELY
-from hydrotele.gap.rivals import Rival, moved_last
+from hydrotele.gap.result import LIKELY, SURE
+from hydrotele.gap.rivals import Found, Ranked, Rival, moved_last
 from hydrotele.gap.run_differences import (
     NUISANCE,
     Quantity,
     between_runs,
+    common_value,
     compare_between_runs,
     effect_of,
     find_columns,
 )
-from hydrotele.gap.screening import Screened
-from hydrotele.gap.search import Found
 
 MIN_LOG_BAYES_FACTOR = 20.0
 """Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
+COMMON_LOG_BAYES_FACTOR = 2.0 * math.log(SURE / (1.0 - SURE))
+"""The same of the common value of a parameter that differs between the runs: a probability of `SURE`."""
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _JOINT = 40  # best effects among which a pair is looked for
@@ -93,7 +95,19 @@ class Model:
     @property
     def charged_score(self) -> float:
         """The score plus what every effect and every coloured noise must bring."""
-        return self.score + MIN_LOG_BAYES_FACTOR * (len(self.guess.parts) + len(self.colours))
+        required = sum(required_evidence(self.guess, k) for k in range(len(self.guess.parts)))
+        return self.score + required + MIN_LOG_BAYES_FACTOR * len(self.colours)
+
+
+def required_evidence(guess: Guess, index: int) -> float:
+    """Return twice the log Bayes factor that a part of a model must bring.
+
+    Whether a parameter that differs between the runs also has another common value is one question, not a choice among
+    all effects.
+    """
+    key = guess.hypotheses[index].key
+    differs = any(h.name == BETWEEN_RUNS and effect_of(h.location) == key for h in guess.hypotheses)
+    return COMMON_LOG_BAYES_FACTOR if differs else MIN_LOG_BAYES_FACTOR
 
 
 @dataclass(frozen=True)
@@ -170,6 +184,7 @@ def search_model(
     now, rounds, first = add_effects(model, given, candidates, has_laws, tell)
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
+    now = compare_common_values(model, now, candidates)
     tell("remove unnecessary effects", 0.87)
     now, rests = remove_needless(model, rounds[0].before if rounds else given, now, rounds)
     tell("compare alternative effects", 0.9)
@@ -183,10 +198,10 @@ def search_model(
         None if h.name in NUISANCE else rest.judged for h, rest in zip(now.guess.hypotheses, rests, strict=True)
     )
     ranking = tuple(
-        Screened(p.parts[0][0], p.factor, p.factor, p.parts[0][1])
+        Ranked(p.parts[0][0], p.factor, p.parts[0][1])
         for p in first if len(p.parts) == 1 and p.factor > 0.0
     )  # fmt: skip
-    return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals, None)
+    return Found(given.judged, now.judged, now.fit, ranking, charges, without, rivals)
 
 
 def add_effects(
@@ -225,12 +240,38 @@ def add_effects(
             now = renew_noise(model, now, better)
         if not better.charged_score < now.charged_score:
             break
-        settled = settle(model, better)
+        settled = compare_common_values(model, settle(model, better), candidates)
         rivals = tuple(compact(model, m) for m in models if m is not better)
         rounds.append(Round(compact(model, now), compact(model, settled), rivals))
         now = settled
         model.keep(now.judged)
     return now, rounds, first
+
+
+def compare_common_values(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> Model:
+    """Compare parameters that differ between the runs with another value in all runs, and with both.
+
+    Differences that are nearly the same in all runs are one wrong value, which an effect names.
+
+    Args:
+        model: whose base is `now`; the returned model is the base afterwards.
+        now: the model, settled.
+        candidates: the effects.
+    """
+    known = {c.key: c for c in candidates if c.size == 1}
+    for part in now.guess.parts:
+        effect = known.get(effect_of(part[0].location))
+        if part[0].name != BETWEEN_RUNS or effect is None or effect.key in keys_of(now):
+            continue
+        index = next(k for k, (h, _) in enumerate(now.guess.parts) if h is part[0])
+        own, varying = common_value(effect, *part)
+        rest = now.guess.without(index)
+        guesses = rest.plus(*own), rest.plus(*varying).plus(*own)
+        judged = [model.judge(guess, reopened=True) for guess in guesses]
+        found = [compact(model, settle(model, Model(one))) for one in judged if np.isfinite(one.loss)]
+        now = min((compact(model, now), *found), key=lambda m: m.charged_score)
+        now = replace(now, judged=model.set_base(now.judged))
+    return now
 
 
 def renew_noise(model: GapModel, now: Model, better: Model) -> Model:
@@ -543,7 +584,8 @@ def remove_needless(
         costs = [rest.score - now.score for rest in rests]
         if now.fit:
             costs = [min(cost, linear_factor(now.fit, [k])) for k, cost in enumerate(costs)]
-        if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
+        costs = [cost - required_evidence(now.guess, k) for k, cost in enumerate(costs)]
+        if not costs or min(costs) > 0.0:
             return now, rests
         now = rests[int(np.argmin(costs))]
 

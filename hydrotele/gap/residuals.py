@@ -19,20 +19,17 @@ The numbers here are set by hand, from trials on a machine of other code whose a
 when they were set; series drawn later judge them (`docs/validation/independent_trials.md`).
 """
 
-import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 from scipy.stats import chi2
 
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import CALIBRATION, LEARNED, Guess
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_size
 from hydrotele.estimate.track import STEP, Track, track_run
-from hydrotele.gap.result import LearnedLaw, NamedEffect
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.log_channels import parse_channel
 from hydrotele.machine.machine import Machine
@@ -258,24 +255,6 @@ def perfect_tracks(
     return tuple(each(one, range(len(tracks))))
 
 
-_PART, _PART_STEEP = 0.35, 0.07  # see `believed_part`
-_LEADS = 0.9  # share of the gap that comes back without an effect that leads
-_LEFT, _LEFT_STEEP = 0.12, 0.03  # see `believed`
-_PIECE = 0.2, 0.99  # probability between which an effect may be one of several pieces
-
-
-def believed_part(part: float) -> float:
-    """Probability that an effect is the mechanism and not something else of the same balance.
-
-    Args:
-        part: share of what the fit runs lacked without it that it takes away.
-
-    Returns:
-        The probability.
-    """
-    return float(expit((part - _PART) / _PART_STEEP))
-
-
 def left_over(before: Track, after: Track, channels: Sequence[str], floor: float | None) -> dict[str, float]:
     """Share of the gap on a run that a patch leaves, of each axis' channels and of all.
 
@@ -296,52 +275,3 @@ def left_over(before: Track, after: Track, channels: Sequence[str], floor: float
         gap, left = (float(np.nanmean(part[own])) - least for part in squares)
         shares[axis] = min(1.0, max(0.0, left / gap)) if gap > 1.0e-3 * least else 0.0
     return shares
-
-
-def believed(
-    named: Sequence[NamedEffect],
-    laws: Sequence[LearnedLaw],
-    left: Mapping[str, float],
-    lost: Collection[str],
-) -> tuple[NamedEffect, ...]:
-    """The effects with what is left taken into account.
-
-    Args:
-        named: the effects, with their probabilities among the library's.
-        laws: that were learned beside them; what they close, the effects leave, but for one without
-            which nearly all of the gap comes back: laws then tell what else there is.
-        left: of `left_over`.
-        lost: axes whose channels still show a gap, "" for channels without axis; none where the
-            patched machine predicts as well as a perfect one.
-
-    Returns:
-        The effects with less probability where something is lacking still: the more is left, the
-        less, and shared where several of one axis, none of which does most by itself, may be
-        pieces of one law.
-    """
-
-    def axis_of(effect: NamedEffect) -> str:
-        axis = effect.location.partition(".")[0]
-        return axis if axis in left else ""
-
-    pieces = [axis_of(effect) for effect in named if _PIECE[0] < effect.probability < _PIECE[1]]
-    found = []
-    for effect in named:
-        axis = axis_of(effect)
-        if not lost or (axis and axis not in lost):
-            found.append(effect)
-            continue
-        beside = [law.share for law in laws if axis in ("", law.axis)]
-        leads = effect.share >= _LEADS and effect.share > max(beside, default=0.0)
-        rest = left[axis] + (0.0 if leads else sum(beside))
-        trust = 1.0 / (1.0 + np.exp((min(rest, 1.0) - _LEFT) / _LEFT_STEEP))
-        if axis and effect.probability < _PIECE[1]:
-            trust /= max(1, pieces.count(axis))
-        found.append(dataclasses.replace(
-            effect, probability=float(trust) * effect.probability,
-            alternatives=tuple(
-                dataclasses.replace(a, probability=float(trust) * a.probability)
-                for a in effect.alternatives
-            ),
-        ))  # fmt: skip
-    return tuple(sorted(found, key=lambda effect: -effect.probability))

@@ -25,7 +25,6 @@ LIKELY = 0.5
 VARIES = "_by_"
 """Joins an effect and the variable with which its coefficient varies."""
 
-Method = Literal["search", "regression"]
 Verdict = Literal["named", "partly", "ambiguous", "learned", "unknown", "no_gap"]
 
 
@@ -214,16 +213,14 @@ class Candidate:
     """A line of the ranking: what naming this effect alone would gain.
 
     Attributes:
-        gain: fall of -2 log likelihood over the fit runs.
-        charge: what its parameters cost (Occam factor), in the same unit.
+        log_bayes_factor: twice the log Bayes factor against the given model, by the linear step.
         parameters: parameter -> value.
         units: parameter -> its SI unit, where the library does not state it.
     """
 
     name: str
     location: str
-    gain: float
-    charge: float
+    log_bayes_factor: float
     parameters: Mapping[str, float]
     units: Mapping[str, str] = field(default_factory=dict)
 

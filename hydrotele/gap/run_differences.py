@@ -110,6 +110,28 @@ def between_runs(quantity: Quantity, runs: Sequence[str], scale: float) -> Hypot
     return Hypothesis(BETWEEN_RUNS, quantity.key, dict.fromkeys(runs, own), change, runs=tuple(runs))
 
 
+def common_value(
+    effect: Hypothesis, differing: Hypothesis, deviation: np.ndarray
+) -> tuple[tuple[Hypothesis, np.ndarray], tuple[Hypothesis, np.ndarray]]:
+    """Split the values of a parameter that differs between runs into their mean and the differences from it.
+
+    Args:
+        effect: changes the same parameter in all runs.
+        differing: the hypothesis of `between_runs`.
+        deviation: (p,) of its runs, the held-out one last.
+
+    Returns:
+        The effect, and the differing parameter, each with its deviation.
+    """
+    (own,) = effect.parameters.values()
+    mean = float(np.mean(deviation[:-1]))
+    start = np.clip(
+        [mean * next(iter(differing.parameters.values())).prior_std / own.prior_std], effect.low, effect.high
+    )
+    moved = np.append(deviation[:-1] - mean, deviation[-1])
+    return (effect, start), (differing, np.clip(moved, differing.low, differing.high))
+
+
 # -- linear step ------------------------------------------------------------------------------------------------------
 
 

@@ -288,21 +288,18 @@ def _residual_colour(ratio: float) -> str:
 
 
 def _ranking(gap: Gap) -> list[dict[str, Any]]:
-    """Return table rows of the up to 12 best single effects, in the order of the ranking.
-
-    The gain of an effect is the decrease of -2 log likelihood minus the complexity penalty.
-    """
+    """Return table rows of the up to 12 best single effects, in the order of the ranking."""
     shown = gap.ranking[:_MAX_RANKED_EFFECTS]
-    best = max((c.gain - c.charge for c in shown), default=1.0)
+    best = max((c.log_bayes_factor for c in shown), default=1.0)
     named = {(effect.name, effect.location) for effect in gap.effects}
     rows = []
     for place, candidate in enumerate(shown, 1):
-        net = candidate.gain - candidate.charge
+        factor = candidate.log_bayes_factor
         rows.append({
-            "place": place, "title": effect_title(candidate), "gain": f"{net:,.0f}",
+            "place": place, "title": effect_title(candidate), "factor": f"{factor:,.0f}",
             "named": (candidate.name, candidate.location) in named,
             "best": ", ".join(_format_parameter(gap, candidate, name) for name in candidate.parameters),
-            "part": net / best if best > 0 else 0.0,
+            "part": factor / best if best > 0 else 0.0,
         })  # fmt: skip
     return rows
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+from hydrotele.gap.screening import screen
 
 import hydrotele as ht
 from hydrotele.estimate.evidence import Evidence
@@ -18,7 +19,6 @@ from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.levels import smoothed_inputs
 from hydrotele.estimate.track import STEP, track_run
 from hydrotele.gap.calibrating import fitted
-from hydrotele.gap.screening import screen
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "how_it_works"
 DEADBAND = 0.03  # of the simulated machine

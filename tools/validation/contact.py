@@ -23,7 +23,6 @@ import numpy as np
 from hydrotele.control.contact import Contact, contact_masks, detect_contact, find_contact_rows
 from hydrotele.estimate.hypothesis import calibration
 from hydrotele.gap.find import find_gap
-from hydrotele.gap.result import Method
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.log import Log, save_log
 from hydrotele.logs.masked_intervals import MaskedInterval, find_unmasked_rows
@@ -132,7 +131,7 @@ def score(found: Contact, truth: Log) -> Score:
     return Score(*(float(rows.sum()) / truth.rate for part, found in parts for rows in (part, part & found)))
 
 
-def friction_trial(seed: int, nominal: Machine, keep: Path | None, method: Method) -> None:
+def friction_trial(seed: int, nominal: Machine, keep: Path | None) -> None:
     """Print what `gap` finds in digging logs of a machine with a hidden friction, with and without the mask."""
     rng = np.random.default_rng(seed)
     axis, more = str(rng.choice([n for n, a in nominal.axes.items() if a.cylinder])), rng.uniform(*FRICTION)
@@ -145,7 +144,7 @@ def friction_trial(seed: int, nominal: Machine, keep: Path | None, method: Metho
             save_log(log, keep / f"friction_{seed}_{k}.parquet")
     found = detect_contact(files, nominal)
     for name, masks in (("mask", contact_masks(found, files)), ("ignore", ())):
-        gap = find_gap(make_dataset(files, nominal, masks=masks), method=method)
+        gap = find_gap(make_dataset(files, nominal, masks=masks))
         named = ", ".join(
             f"{e.name} at {e.location} ({e.probability:.2f}) "
             + " ".join(f"{key} {p.value:.4g} [{p.low:.4g}, {p.high:.4g}]" for key, p in e.parameters.items())
@@ -161,7 +160,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="JSON file for the figures")
     parser.add_argument("--keep", type=Path, help="existing folder for the logs")
     parser.add_argument("--friction", type=int, nargs="*", default=[], help="seeds of gap runs with a hidden friction")
-    parser.add_argument("--method", choices=("search", "regression"), default="regression", help="of these gap runs")
     chosen = parser.parse_args(arguments)
     nominal, total, rows = load_machine("cat215", "bucket"), None, []
     print("| seed | contact [s] | contact found [%] | contact above 1 kN found [%] | free [s]"
@@ -180,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if total:
         print(total.row("all"))
     for seed in chosen.friction:
-        friction_trial(seed, nominal, chosen.keep, chosen.method)
+        friction_trial(seed, nominal, chosen.keep)
     if chosen.out and total:
         chosen.out.write_text(json.dumps(dataclasses.asdict(total)))
 

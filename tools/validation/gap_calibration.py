@@ -18,12 +18,12 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from hydrotele.gap.screening import screen
 
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.gap.residuals import LIMITS, residual_tests
 from hydrotele.gap.rivals import ENTER
-from hydrotele.gap.screening import screen
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
 from tools.validation.blind.run_trial import ROOT

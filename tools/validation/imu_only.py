@@ -100,7 +100,6 @@ def main() -> None:
     parser.add_argument("--effect", choices=sorted(EFFECTS), help="hidden effect; default: drawn")
     parser.add_argument("--gyro-noise", type=float, default=GYRO_NOISE, help="rad/s per reading at 50 Hz")
     parser.add_argument("--no-gap", action="store_true")
-    parser.add_argument("--method", choices=("search", "regression"), default="regression", help="of gap")
     arguments = parser.parse_args()
     errors, ratios, answers = [], [], []
     for trial in range(arguments.seed, arguments.seed + arguments.trials):
@@ -126,7 +125,7 @@ def main() -> None:
             continue
         gap = [*command, "gap", "--data", str(folder / "calibrated/logs"), "--machine",
                str(folder / "calibrated/machine.yaml"), "--out", str(folder / "gap"),
-               "--method", arguments.method, "--json"]  # fmt: skip
+               "--json"]  # fmt: skip
         result = subprocess.run(gap, check=False, capture_output=True, text=True)
         document = json.loads((folder / "gap" / "gap.json").read_text()) if not result.returncode else {}
         named = [f"{e['name']}({e['location']})" for e in document.get("effects", [])]

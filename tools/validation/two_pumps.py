@@ -2,7 +2,7 @@
 
     python tools/validation/two_pumps.py                                  # steady states and limit cases
     python tools/validation/two_pumps.py --trials 20 --out runs/pumps     # and 20 trials of each fault
-    python tools/validation/two_pumps.py --trials 20 --out runs/pumps --method regression
+    python tools/validation/two_pumps.py --trials 20 --out runs/pumps
 
 Three vertical cylinders lift constant loads at full command. Their steady velocities are chosen;
 pressures, pump flows and engine power follow in closed form, without functions of the package. A
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from hydrotele.gap.find import Method, find_gap
+from hydrotele.gap.find import find_gap
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine import Machine
@@ -205,7 +205,7 @@ def random_motion(random: np.random.Generator) -> dict:
     return {"kind": "fourier", "period": 20.0, "fade": 2.0, "axes": axes}
 
 
-def run_trial(fault: str, seed: int, out: Path, method: Method, jobs: int) -> dict:
+def run_trial(fault: str, seed: int, out: Path, jobs: int) -> dict:
     """Simulate two runs with a fault of random size, search them, and return truth and answer."""
     random = np.random.default_rng((seed, sorted(FAULTS).index(fault)))
     machine = load_machine(MACHINE)
@@ -225,7 +225,7 @@ def run_trial(fault: str, seed: int, out: Path, method: Method, jobs: int) -> di
         (folder / f"run_{k}").mkdir(parents=True, exist_ok=True)
         save_log(run_scenario(scenario).measured.without_truth(), folder / f"run_{k}" / "measured.parquet")
     begun = time.process_time()
-    gap = find_gap(load_dataset(folder, machine, force=True), jobs=jobs, method=method)
+    gap = find_gap(load_dataset(folder, machine, force=True), jobs=jobs)
     named = [(e.name, e.location, e.parameters) for e in gap.effects]
     return {
         "fault": fault, "seed": seed, "value": value, "verdict": gap.verdict, "named": named,
@@ -240,7 +240,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first trial")
     parser.add_argument("--faults", nargs="+", choices=sorted(FAULTS), default=sorted(FAULTS))
     parser.add_argument("--out", type=Path, default=Path("runs/two_pumps"), help="folder of the logs")
-    parser.add_argument("--method", choices=("search", "regression"), default="search")
     parser.add_argument("--jobs", type=int, default=1)
     given = parser.parse_args()
     print("| quantity | by hand | simulated | relative difference |\n| --- | ---: | ---: | ---: |")
@@ -251,7 +250,7 @@ def main() -> None:
     trials = []
     for seed in range(given.seed, given.seed + given.trials):
         for fault in given.faults:
-            trials.append(run_trial(fault, seed, given.out, given.method, given.jobs))
+            trials.append(run_trial(fault, seed, given.out, given.jobs))
             t = trials[-1]
             answer = ", ".join(
                 f"{name}({where}) " + " ".join(f"{k} {p.value:.4g}" for k, p in values.items())

@@ -1,13 +1,13 @@
-"""Compare the two methods of the gap search, `search` and `regression`, on cases with known answers.
+"""Run the gap search on cases with known answers: public benchmark cases and series of blind trials.
 
-    python tools/studies/gap_methods.py --open ../shared/measured --out runs/gap_methods
+    python tools/validation/gap_cases.py --open ../shared/measured --out runs/cases
     python tools/validation/blind_world.py --out runs/world --kinds near:5,noise:4,clean:3 --seed 61 --make-only
-    python tools/studies/gap_methods.py --series runs/world --out runs/gap_methods
-    python tools/studies/gap_methods.py --open ../shared/measured --only open_08 --methods regression --out runs/one
+    python tools/validation/gap_cases.py --series runs/world --out runs/cases
 
 `--open` is the folder of the public benchmark cases, `--series` a series of blind trials of the independent simulator
 whose logs are made. Every case is searched in a copy that holds the logs only. Results that are there are kept. Prints
-a Markdown table: named effects, whether every hidden effect is named, effects named falsely, processor time.
+a Markdown table: named effects, whether every hidden effect is named, effects named falsely, processor time; then the
+number of right answers per kind, with Wilson intervals.
 """
 
 import argparse
@@ -16,12 +16,13 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+from scipy.stats import binomtest
 
 from hydrotele.core.errors import InputError
 from hydrotele.gap.find import find_gap
@@ -32,7 +33,6 @@ from tools.validation.blind.trials import Place, write_json
 from tools.validation.blind.world_trials import load_world_series
 from tools.validation.open_cases import expected
 
-METHODS = ("search", "regression")
 _NAMING = ("named", "partly", "ambiguous")
 
 
@@ -75,7 +75,7 @@ def list_trials(out: Path) -> Iterator[Case]:
         yield Case(f"{key['kind']} {name}", place.data, series.machine, hidden, key["kind"] != "outside")
 
 
-def search_case(case: Case, method: str, jobs: int) -> dict[str, Any]:
+def search_case(case: Case, jobs: int) -> dict[str, Any]:
     """Search a case and return its `gap.json` document with the processor time [s]."""
     with tempfile.TemporaryDirectory() as scratch:
         copy = Path(scratch, "data")
@@ -86,7 +86,7 @@ def search_case(case: Case, method: str, jobs: int) -> dict[str, Any]:
         def tell(text: str, share: float) -> None:
             print(f"{time.process_time() - start:6.0f} s {100 * share:3.0f} % {text}", file=sys.stderr, flush=True)
 
-        gap = find_gap(data, tell, jobs=jobs, method=method)
+        gap = find_gap(data, tell, jobs=jobs)
     return gap_document(gap) | {"processor_seconds": time.process_time() - start}
 
 
@@ -108,7 +108,7 @@ def judge_case(case: Case, document: dict[str, Any]) -> dict[str, Any]:
     return {"named": named, "found": found, "false": false}
 
 
-def format_row(case: Case, method: str, document: dict[str, Any]) -> str:
+def format_row(case: Case, document: dict[str, Any]) -> str:
     """Return a row of the table."""
     verdict = judge_case(case, document)
     hidden = ", ".join(" ".join(pairs[0]) for pairs in case.hidden if pairs)
@@ -117,10 +117,20 @@ def format_row(case: Case, method: str, document: dict[str, Any]) -> str:
     size, answers = document["gap"], document.get("answers") or []
     sure = "; ".join(" / ".join(a["sure"]) or "-" for a in answers) or "-"
     return (
-        f"| {case.name} | {hidden} | {method} | {document['verdict']} | {named} | {sure} | {size['before']:.2f} |"
+        f"| {case.name} | {hidden} | {document['verdict']} | {named} | {sure} | {size['before']:.2f} |"
         f" {size['after']:.2f} | {'yes' if verdict['found'] else 'no'} | {verdict['false']} |"
         f" {document['processor_seconds']:.0f} |"
     )
+
+
+def print_summary(right: Mapping[str, Sequence[bool]]) -> None:
+    """Print the number of right answers per kind, with 95 % Wilson intervals."""
+    print("\n| kind | right answers | 95 % interval |\n| --- | --- | --- |")
+    for kind, answers in {**right, "all": [one for each in right.values() for one in each]}.items():
+        interval = binomtest(sum(answers), len(answers)).proportion_ci(method="wilson")
+        print(
+            f"| {kind} | {sum(answers)} of {len(answers)} | {100 * interval.low:.0f} to {100 * interval.high:.0f} % |"
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -129,7 +139,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--open", type=Path, help="folder of the public benchmark cases")
     parser.add_argument("--series", type=Path, help="folder of a series of blind trials")
     parser.add_argument("--only", nargs="+", default=[], metavar="CASE")
-    parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results")
     parser.add_argument("--jobs", type=int, default=1, help="processors that one search may use")
     args = parser.parse_args(arguments)
@@ -139,14 +148,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(InputError("--open, --series", "hold no case: give one of them, and --only with its cases"))
         return 2
     args.out.mkdir(parents=True, exist_ok=True)
-    print("| case | hidden | method | verdict | named | sure level | error before | after | found | false | time [s] |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    print("| case | hidden | verdict | named | sure level | error before | after | found | false | time [s] |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    right: dict[str, list[bool]] = {}
     for case in cases:
-        for method in args.methods:
-            file = args.out / f"{case.name.replace(' ', '_')}_{method}.json"
-            if not file.is_file():
-                write_json(file, search_case(case, method, args.jobs))
-            print(format_row(case, method, json.loads(file.read_text())), flush=True)
+        file = args.out / f"{case.name.replace(' ', '_')}.json"
+        if not file.is_file():
+            write_json(file, search_case(case, args.jobs))
+        document = json.loads(file.read_text())
+        print(format_row(case, document), flush=True)
+        found = judge_case(case, document)
+        right.setdefault(case.name.partition(" ")[0], []).append(found["found"] and not found["false"])
+    print_summary(right)
     return 0
 
 
