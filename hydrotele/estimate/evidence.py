@@ -595,7 +595,7 @@ def _blocks(track: Track, seconds: float) -> np.ndarray:
 _FEW = 10  # numbers up to which slopes are taken at the finest step
 _CHANCE = 3.0  # chi-square per degree of freedom that two degrees exceed in 5 % of all cases
 _STRETCHES = 40  # of the runs, if they are not shorter than what unknown inputs remember
-_DENTED = ("backlash",)  # effects whose likelihood is full of dents, see `gap.screening`
+_DENTED = ("backlash",)  # effects whose likelihood is full of dents, see `gap.backlash`
 _NEAR = (0.5, 1.0, 2.0)  # standard deviations, within which the depth of dents is looked for
 _MOST = 0.8  # of the dents seen are no deeper; where a filter loses its machine one is far deeper
 _FARTHEST = 256.0  # standard deviations to which dents are followed

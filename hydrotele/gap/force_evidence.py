@@ -672,6 +672,12 @@ class ForceEvidence(GapModel):
             interval=(start, end - start), choice_cost=_CHOICE_OF_INTERVAL,
         )  # fmt: skip
 
+    def search_directly(
+        self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
+    ) -> Judged | None:  # fmt: skip
+        """Return None; no effect of a mechanism needs it."""
+        return None
+
     def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:
         """Return None: the shape of the noise holds its colour."""
         return None

@@ -181,6 +181,12 @@ class GapModel(Protocol):
         """
         return []
 
+    def search_directly(
+        self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
+    ) -> Judged | None:  # fmt: skip
+        """Return a model with an effect whose likelihood has many local optima; None where nothing is missing there, or it does not help."""
+        ...
+
     def select_priors(self, guess: Guess) -> Guess:
         """Select the prior of every learned law and profile of the base by its evidence."""
         return guess

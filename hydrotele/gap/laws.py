@@ -82,6 +82,7 @@ FORMS: Mapping[str, Form] = {
         THROUGH, "flow", 1.0, "root(pressure_head - pressure_rod, {d!r})",
         lambda s, c: _root(s["pressure_head"] - s["pressure_rod"], c["d"]),
     ),
+    "valve_gain": Form("command", "ratio", 1.0, "command", lambda s, c: s["command"]),
 }  # fmt: skip
 """Effects whose coefficient may vary, as terms of a balance."""
 _VARIED_BY = ("position", "velocity", "command", "force", "pressure_head", "pressure_rod", "time")
@@ -292,7 +293,9 @@ def list_forms(
         tables = {v: Table((v,), (points,)) for v, points in place_knots(seen, axis, _KNOTS[1], smoothing).items()}
         if has_laws:
             size = _TYPICAL * float(input_sizes(machine, [Input(_side_of(balance), axis)])[0])
-            forms += [LawForm(balance, axis, table, size, smoothing) for table in tables.values()]
+            # a command that depends on the command alone is the curve of the valve: a gain by command
+            known = "command" if balance == "command" and "valve_gain" in effects else ""
+            forms += [LawForm(balance, axis, table, size, smoothing) for v, table in tables.items() if v != known]
         for effect in effects:
             if (
                 effect not in FORMS

@@ -13,6 +13,7 @@ from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
+from hydrotele.gap.backlash import add_backlash, is_unexplained
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
 from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
@@ -126,6 +127,15 @@ class MachineModel(GapModel):
             gained = sum(old.loss - new.loss for old, new in zip(evidence.tracks, tracks, strict=True))
             found += [(part, gained + f, scale) for part, f in compare_disturbances(tried, tracks, evidence.map)]
         return found
+
+    def search_directly(
+        self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
+    ) -> Judged | None:  # fmt: skip
+        """Search backlash of an axis whose motion the model does not explain."""
+        if not is_unexplained(judged, effect.location):
+            return None
+        tell(f"search for backlash of the {effect.location}", 0.7)
+        return add_backlash(self.evidence, judged.guess, effect.location)
 
     def select_priors(self, guess: Guess) -> Guess:
         """Select priors in the linearised model of all rows."""

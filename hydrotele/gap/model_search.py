@@ -10,7 +10,6 @@ group. Its log evidence has noise levels and residual inputs re-estimated for it
 4. Remove every effect whose removal costs less than that; exchange an effect for a better rival.
 """
 
-import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -19,6 +18,7 @@ import numpy as np
 from hydrotele.estimate.evidence import Fit, Judged, invert_information, occam_penalty
 from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis
 from hydrotele.gap.answer import family_of
+from hydrotele.gap.backlash import BACKLASH
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.gap_model import GapModel, Linearisation
@@ -32,7 +32,7 @@ from hydrotele.gap.regression import (
     sum_equations,
     sum_of_single_effects,
 )
-from hydrotele.gap.result import LIKELY, SURE
+from hydrotele.gap.result import LIKELY
 from hydrotele.gap.rivals import Found, Ranked, Rival, moved_last
 from hydrotele.gap.run_differences import (
     NUISANCE,
@@ -42,12 +42,11 @@ from hydrotele.gap.run_differences import (
     compare_between_runs,
     effect_of,
     find_columns,
+    has_common_value,
 )
 
 MIN_LOG_BAYES_FACTOR = 20.0
 """Twice the log Bayes factor that an effect must bring. The choice among 200 candidates costs 2 log 200 = 10.6."""
-COMMON_LOG_BAYES_FACTOR = 2.0 * math.log(SURE / (1.0 - SURE))
-"""The same of the common value of a parameter that differs between the runs: a probability of `SURE`."""
 PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 """Standard deviations of the uncertain parameters, relative to those that the machine file states."""
 _JOINT = 40  # best effects among which a pair is looked for
@@ -59,7 +58,6 @@ _CLOSE = 100.0  # twice the log Bayes factor; a rival that stays farther behind 
 _KEPT = 50  # effects that are linearised again after the first round
 _SETTLED = 1.0  # twice the log likelihood; a smaller change of the noise levels' likelihood ends their estimation
 _MAX_NOISE_ROUNDS = 3  # of the estimation of the noise levels
-_EXCLUDED = ("backlash",)  # its likelihood has a local optimum at every contact; needs a separate search
 Progress = Callable[[str, float], None]
 
 
@@ -95,19 +93,7 @@ class Model:
     @property
     def charged_score(self) -> float:
         """The score plus what every effect and every coloured noise must bring."""
-        required = sum(required_evidence(self.guess, k) for k in range(len(self.guess.parts)))
-        return self.score + required + MIN_LOG_BAYES_FACTOR * len(self.colours)
-
-
-def required_evidence(guess: Guess, index: int) -> float:
-    """Return twice the log Bayes factor that a part of a model must bring.
-
-    Whether a parameter that differs between the runs also has another common value is one question, not a choice among
-    all effects.
-    """
-    key = guess.hypotheses[index].key
-    differs = any(h.name == BETWEEN_RUNS and effect_of(h.location) == key for h in guess.hypotheses)
-    return COMMON_LOG_BAYES_FACTOR if differs else MIN_LOG_BAYES_FACTOR
+        return self.score + MIN_LOG_BAYES_FACTOR * (len(self.guess.parts) + len(self.colours))
 
 
 @dataclass(frozen=True)
@@ -180,7 +166,7 @@ def search_model(
     tell("estimate the noise levels of the given model", 0.0)
     given = Model(settle_noise(model, model.judge(Guess())))
     model.keep(given.judged)
-    candidates = model.prepare([c for c in candidates if c.name not in _EXCLUDED], given.judged)
+    candidates = model.prepare(candidates, given.judged)
     now, rounds, first = add_effects(model, given, candidates, has_laws, tell)
     tell("compare coloured noise", 0.85)
     now = compare_colours(model, now)
@@ -223,6 +209,8 @@ def add_effects(
     first = tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
+    direct = [c for c in candidates if is_direct(c)]
+    candidates = [c for c in candidates if not is_direct(c)]
     for index in range(model.max_effects):
         share = 0.05 + 0.8 * index / model.max_effects
         tell("compare effects", share)
@@ -236,6 +224,8 @@ def add_effects(
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
+        if not better.charged_score < now.charged_score:
+            better = min(search_directly(model, now, direct, tell), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
             now = renew_noise(model, now, better)
         if not better.charged_score < now.charged_score:
@@ -249,9 +239,10 @@ def add_effects(
 
 
 def compare_common_values(model: GapModel, now: Model, candidates: Sequence[Hypothesis]) -> Model:
-    """Compare parameters that differ between the runs with another value in all runs, and with both.
+    """Give a parameter that differs between the runs another common value, where its mean is significantly nonzero.
 
-    Differences that are nearly the same in all runs are one wrong value, which an effect names.
+    Values that are nearly the same in all runs are one wrong value, which an effect names; whether it also differs
+    between the runs is then compared again. No difference between runs stands without the effect of its mean.
 
     Args:
         model: whose base is `now`; the returned model is the base afterwards.
@@ -263,15 +254,41 @@ def compare_common_values(model: GapModel, now: Model, candidates: Sequence[Hypo
         effect = known.get(effect_of(part[0].location))
         if part[0].name != BETWEEN_RUNS or effect is None or effect.key in keys_of(now):
             continue
+        if not has_common_value(part[1][:-1]):
+            continue
         index = next(k for k, (h, _) in enumerate(now.guess.parts) if h is part[0])
         own, varying = common_value(effect, *part)
         rest = now.guess.without(index)
-        guesses = rest.plus(*own), rest.plus(*varying).plus(*own)
-        judged = [model.judge(guess, reopened=True) for guess in guesses]
+        judged = [model.judge(guess, reopened=True) for guess in (rest.plus(*own), rest.plus(*varying).plus(*own))]
         found = [compact(model, settle(model, Model(one))) for one in judged if np.isfinite(one.loss)]
-        now = min((compact(model, now), *found), key=lambda m: m.charged_score)
+        now = min(found, key=lambda m: m.charged_score, default=now)
         now = replace(now, judged=model.set_base(now.judged))
     return now
+
+
+def is_direct(effect: Hypothesis) -> bool:
+    """Return whether an effect is searched directly, because its likelihood has many local optima."""
+    return effect.name == BACKLASH
+
+
+def search_directly(model: GapModel, now: Model, effects: Sequence[Hypothesis], tell: Progress) -> list[Model]:
+    """Return the model with each of some effects that the errors suggest and that a direct search finds, fitted.
+
+    Args:
+        model: whose base is `now`; it is the base afterwards, too.
+        now: the model.
+        effects: with many local optima.
+        tell: called with (what is done, fraction done).
+    """
+    found = []
+    for effect in effects:
+        if effect.key in keys_of(now):
+            continue
+        judged = model.search_directly(now.judged, effect, tell)
+        if judged is not None:
+            found.append(compact(model, settle(model, Model(judged))))
+        model.set_base(now.judged)
+    return found
 
 
 def renew_noise(model: GapModel, now: Model, better: Model) -> Model:
@@ -560,6 +577,9 @@ def compare_colours(model: GapModel, now: Model) -> Model:
 def without_part(model: GapModel, given: Model, now: Model, index: int, rounds: Sequence[Round]) -> Model:
     """Return a model without one of its effects, fitted again; the larger model is the base afterwards."""
     guess = now.guess.without(index)
+    key = now.guess.hypotheses[index].key
+    # no difference between runs stands without the effect of its mean
+    guess = Guess(tuple(p for p in guess.parts if p[0].name != BETWEEN_RUNS or effect_of(p[0].location) != key))
     if not guess.parts and not now.colours:
         return given
     for known in rounds:
@@ -584,8 +604,7 @@ def remove_needless(
         costs = [rest.score - now.score for rest in rests]
         if now.fit:
             costs = [min(cost, linear_factor(now.fit, [k])) for k, cost in enumerate(costs)]
-        costs = [cost - required_evidence(now.guess, k) for k, cost in enumerate(costs)]
-        if not costs or min(costs) > 0.0:
+        if not costs or min(costs) > MIN_LOG_BAYES_FACTOR:
             return now, rests
         now = rests[int(np.argmin(costs))]
 

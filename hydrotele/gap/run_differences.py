@@ -20,7 +20,7 @@ from hydrotele.estimate.evidence import Fit, Judged, invert_information
 from hydrotele.estimate.hypothesis import BETWEEN_RUNS, CALIBRATION, Guess, Hypothesis, calibration, numbers
 from hydrotele.gap.dictionary import AMPLITUDES, Version
 from hydrotele.gap.regression import NormalEquations, compare_groups, split_columns
-from hydrotele.gap.result import RunDifference
+from hydrotele.gap.result import SURE, RunDifference
 from hydrotele.logs.dataset import RunData
 from hydrotele.machine.machine import Machine
 
@@ -108,6 +108,14 @@ def between_runs(quantity: Quantity, runs: Sequence[str], scale: float) -> Hypot
         return quantity.shift(machine, amount)
 
     return Hypothesis(BETWEEN_RUNS, quantity.key, dict.fromkeys(runs, own), change, runs=tuple(runs))
+
+
+def has_common_value(values: np.ndarray) -> bool:
+    """Return whether the mean of the values of runs (n,) differs from 0, by Student's test at the level `SURE`."""
+    if len(values) < 2:
+        return False
+    error = float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return abs(float(np.mean(values))) > error * float(student_t.ppf(0.5 + 0.5 * SURE, len(values) - 1))
 
 
 def common_value(

@@ -25,6 +25,7 @@ import yaml
 from scipy.stats import binomtest
 
 from hydrotele.core.errors import InputError
+from hydrotele.gap.answer import base_effect
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import LIKELY, gap_document
 from hydrotele.logs.dataset import load_dataset
@@ -98,7 +99,7 @@ def judge_case(case: Case, document: dict[str, Any]) -> dict[str, Any]:
         unchanged machine or an unmodelled effect: whether nothing is named); `false`: number of wrong ones.
     """
     naming = document["effects"] if document["verdict"] in _NAMING else []
-    named = [(e["name"], e["location"]) for e in naming if e["probability"] > LIKELY]
+    named = [(base_effect(e["name"]), e["location"]) for e in naming if e["probability"] > LIKELY]
     right = {pair for pairs in case.hidden for pair in pairs}
     false = sum(pair not in right for pair in named)
     if case.is_known and case.hidden:
