@@ -1,6 +1,6 @@
-"""Effect of oil and grease that warm up during a run: less viscous friction, more leakage."""
+"""Oil and grease of another viscosity, and their warming during a run: less viscous friction, more leakage."""
 
-from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
+from hydrotele.effects.effect import Effect, Parameter, Values, drive_kind, with_terms, with_value
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.term import Term
 
@@ -66,7 +66,38 @@ def _set_warming(machine: Machine, location: str, values: Values) -> Machine:
     return with_terms(machine, NAME, terms)
 
 
-EFFECT = Effect(
-    NAME, "warming oil, with less viscous friction and more leakage", "force", _warming_locations, _warming_parameters,
-    _set_warming,
+def _viscosity_locations(machine: Machine) -> tuple[str, ...]:
+    """Return `all`, where the viscosity acts on more than one coefficient of a hydraulic machine."""
+    count = len(_viscous_friction(machine)) + len(_leakage_coefficients(machine))
+    return (ALL_AXES,) if machine.hydraulic_axes and count > 1 else ()
+
+
+def _viscosity_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    """Return nominal value (1), bounds and prior of the viscosity relative to that of the given machine.
+
+    A difference of 10 K changes the viscosity of hydraulic oil by some 30 %. The smallest relevant change of the
+    ratio is 0.05, which corresponds to 2 K.
+    """
+    return {"ratio": Parameter("1", 1.0, 0.1, 10.0, 0.3, 0.05)}
+
+
+def _set_viscosity(machine: Machine, location: str, values: Values) -> Machine:
+    """Return the machine with viscous friction of all axes times a ratio, and leakage past all pistons over it."""
+    ratio = values["ratio"]
+    for axis, viscous in _viscous_friction(machine).items():
+        machine = with_value(machine, f"axes.{axis}.{drive_kind(machine, axis)}.friction.viscous", ratio * viscous)
+    for axis, leakage in _leakage_coefficients(machine).items():
+        machine = with_value(machine, f"axes.{axis}.{drive_kind(machine, axis)}.leakage", leakage / ratio)
+    return machine
+
+
+EFFECTS = (
+    Effect(
+        NAME, "warming oil, with less viscous friction and more leakage", "force", _warming_locations,
+        _warming_parameters, _set_warming,
+    ),
+    Effect(
+        "oil_viscosity", "viscosity of oil and grease that differs from the model, for example at another temperature",
+        "force", _viscosity_locations, _viscosity_parameters, _set_viscosity,
+    ),
 )  # fmt: skip

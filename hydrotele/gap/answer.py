@@ -19,6 +19,7 @@ FAMILIES: Mapping[str, tuple[str, ...]] = {
     "friction": (
         "coulomb_friction", "viscous_friction", "stribeck_friction", "friction_asymmetry", "presliding",
         "load_dependent_friction", "position_dependent_friction", "speed_dependent_force", "warming",
+        "oil_viscosity",
     ),
     "leakage": ("internal_leakage", "tank_leakage", "orifice_leakage"),
     "compliance": ("hose_compliance", "bulk_modulus", "entrained_air", "joint_flexibility", "backlash", "joint_spring"),

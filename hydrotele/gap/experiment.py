@@ -377,6 +377,7 @@ OF_EFFECT: Mapping[str, tuple[str, ...]] = {
     "force_pulse": ("reversals",),
     "speed_dependent_force": ("reversals",),
     "warming": ("reversals",),
+    "oil_viscosity": ("reversals", "holds"),
     "position_dependent_friction": ("sweeps", "reversals"),
     "end_stop_stiffness": ("sweeps",),
     "orifice_leakage": ("holds",),

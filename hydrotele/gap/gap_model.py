@@ -184,7 +184,7 @@ class GapModel(Protocol):
     def search_directly(
         self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
     ) -> Judged | None:  # fmt: skip
-        """Return a model with an effect whose likelihood has many local optima; None where nothing is missing there, or it does not help."""
+        """Return a model with an effect whose likelihood has many local optima; None if it does not help."""
         ...
 
     def select_priors(self, guess: Guess) -> Guess:

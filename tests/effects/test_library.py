@@ -33,7 +33,7 @@ PLACES = {
     "pressure_offset": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
     "pressure_delay": ARM, "external_force": ARM, "force_pulse": ARM,
     "speed_dependent_force": ARM, "load_dependent_friction": ARM,
-    "position_dependent_friction": ARM, "orifice_leakage": ARM, "warming": {"all"},
+    "position_dependent_friction": ARM, "orifice_leakage": ARM, "warming": {"all"}, "oil_viscosity": {"all"},
     "command_offset": ARM, "valve_gain_direction": ARM, "valve_deadband_direction": ARM,
     "metering_edges": ARM, "flow_curve": ARM, "spool_slew": ARM, "load_compensation": ARM,
     "load_holding": {f"{axis}.{side}" for axis in ARM for side in ("head", "rod")},
@@ -132,7 +132,7 @@ def check_change(machine, tool, name, place):
     assert before == untouched(machine, tool), "the caller's machine is untouched"
     type(after).model_validate(after.model_dump())  # still a possible machine
     if name not in ("payload", "com_offset", "inertia_error", "base_tilt", "link_length",
-                    "pin_offset", "valve_gain", "valve_gain_direction", "flow_curve"):  # fmt: skip
+                    "pin_offset", "valve_gain", "valve_gain_direction", "flow_curve", "oil_viscosity"):  # fmt: skip
         again = {k: p.nominal for k, p in EFFECTS[name].parameters(after, place).items()}
         assert again == pytest.approx(changed, rel=1e-12), "the machine shows what was set"
 
