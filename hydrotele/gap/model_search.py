@@ -224,10 +224,10 @@ def add_effects(
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
-        if not better.charged_score < now.charged_score:
-            better = min(search_directly(model, now, direct, tell), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
             now = renew_noise(model, now, better)
+        if not better.charged_score < now.charged_score:
+            better = min(search_directly(model, now, direct, tell), key=lambda m: m.charged_score, default=now)
         if not better.charged_score < now.charged_score:
             break
         settled = compare_common_values(model, settle(model, better), candidates)
