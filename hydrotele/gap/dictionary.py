@@ -46,6 +46,17 @@ class Version:
         """(q,) amplitude of each column [prior standard deviations]."""
         return np.linalg.norm(self.steps, axis=0)
 
+    @property
+    def bounds(self) -> np.ndarray:
+        """(q, 2) bounds of the coefficient of each column alone [prior standard deviations]."""
+        unit, low, high = self.steps / self.lengths, self.hypothesis.low, self.hypothesis.high
+        found = np.empty((unit.shape[1], 2))
+        for k, column in enumerate(unit.T):
+            moved = column != 0.0
+            ends = np.sort([low[moved] / column[moved], high[moved] / column[moved]], axis=0)
+            found[k] = ends[0].max(), ends[1].min()
+        return found
+
     def deviation(self, mean: np.ndarray) -> np.ndarray:
         """Return the deviation (p,) at which to start the refinement.
 

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import czt
@@ -29,7 +30,7 @@ PERIODIC_FORCE = "periodic_force"
 _PULSE = ("size", "start", "duration")  # parameters of an effect of limited duration
 _PERIODIC_STD = 0.03  # of the largest force, as the prior of a pulse
 _WAVES = ("cosine", "sine")  # parameters of a periodic force in one run, which are also functions of a formula
-_INSTANTS = 160  # of a run at which a pulse may start or end; its refinement is continuous
+_INSTANTS = 160  # at which a pulse may start or end: of a run, and then near the best of these
 _CHOICE_OF_INTERVAL = 2.0 * math.log(0.5 * _INSTANTS * (_INSTANTS - 1))  # all are equally probable
 _MIN_CYCLES = 3.0  # in a run, of a periodic force; a slower one is a law of the time
 _MIN_ROWS = 4.0  # of a period: a faster one does not show in rows
@@ -154,17 +155,46 @@ def _clock(track: Track) -> np.ndarray:
 
 
 def _locate_pulse(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]:
-    """Find the interval of a pulse that makes it most likely.
+    """Find the interval of a pulse that makes it most likely: first on a coarse grid, then to a row."""
+    acting = [t for t in tracks if not h.runs or t.run.name in h.runs]
+    knots = np.linspace(min(_clock(t)[0] for t in acting), max(_clock(t)[-1] for t in acting), _INSTANTS)
+    best, spacing = _best_interval(h, acting, knots), float(knots[1] - knots[0])
+    while spacing > min(t.run.period for t in acting):
+        near = np.linspace(-spacing, spacing, _INSTANTS // 2)
+        spacing = float(near[1] - near[0])
+        finer = _best_interval(h, acting, np.unique(np.append(best.start + near, best.end + near)))
+        best = max(best, finer, key=lambda interval: interval.factor)
+    table = dict(h.parameters)
+    seconds = best.end - best.start
+    for key, value in (("start", best.start), ("duration", seconds)):
+        low, high = min(table[key].lower_bound, value), max(table[key].upper_bound, value)
+        table[key] = replace(
+            table[key], nominal=value, prior_std=seconds, lower_bound=low, upper_bound=high, start_values=()
+        )  # fmt: skip
+    table = {key: replace(p, start_values=()) for key, p in table.items()}
+    located = replace(h, parameters=table, choice_cost=_CHOICE_OF_INTERVAL)
+    deviation = np.array([best.mean if key == "size" else 0.0 for key in table])
+    return (located, np.clip(deviation, located.low, located.high)), best.factor - _CHOICE_OF_INTERVAL
+
+
+class _Interval(NamedTuple):
+    """When a pulse acts [s], twice its log Bayes factor, and its size [prior standard deviations]."""
+
+    start: float
+    end: float
+    factor: float
+    mean: float
+
+
+def _best_interval(h: Hypothesis, tracks: Sequence[Track], knots: np.ndarray) -> _Interval:
+    """Return the most likely interval between two of some instants (K,).
 
     A pulse is the difference of two steps, so the Gram matrix of steps at all instants gives the Bayes factor of every
     interval.
     """
-    acting = [t for t in tracks if not h.runs or t.run.name in h.runs]
-    begin, end = min(_clock(t)[0] for t in acting), max(_clock(t)[-1] for t in acting)
-    knots = np.linspace(begin, end, _INSTANTS)
     size = h.parameters["size"]
-    right, gram = np.zeros(_INSTANTS), np.zeros((_INSTANTS, _INSTANTS))
-    for track in acting:
+    right, gram = np.zeros(len(knots)), np.zeros((len(knots), len(knots)))
+    for track in tracks:
         steps = size.prior_std * (_clock(track)[:, None] >= knots)
         columns = _responses(track, h, steps)
         right -= columns.T @ flat(track.whitened)
@@ -174,18 +204,9 @@ def _locate_pulse(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]:
     pull = right[:, None] - right
     factors = np.triu(pull**2 / precision - np.log(precision), 1)
     first, last = np.unravel_index(int(np.argmax(factors)), factors.shape)
-    seconds = float(knots[last] - knots[first]) or float(knots[1] - knots[0])
-    table = dict(h.parameters)
-    for key, value in (("start", float(knots[first])), ("duration", seconds)):
-        low, high = min(table[key].lower_bound, value), max(table[key].upper_bound, value)
-        table[key] = replace(
-            table[key], nominal=value, prior_std=seconds, lower_bound=low, upper_bound=high, start_values=()
-        )  # fmt: skip
-    table = {key: replace(p, start_values=()) for key, p in table.items()}
-    located = replace(h, parameters=table, choice_cost=_CHOICE_OF_INTERVAL)
+    end = float(knots[last]) if last > first else float(knots[first] + (knots[1] - knots[0]))
     mean = float(pull[first, last] / precision[first, last])
-    deviation = np.array([mean if key == "size" else 0.0 for key in table])
-    return (located, np.clip(deviation, located.low, located.high)), float(factors[first, last]) - _CHOICE_OF_INTERVAL
+    return _Interval(float(knots[first]), end, float(factors[first, last]), mean)
 
 
 def _compare_waves(h: Hypothesis, tracks: Sequence[Track]) -> tuple[Part, float]:

@@ -85,6 +85,8 @@ FORMS: Mapping[str, Form] = {
     "valve_gain": Form("command", "ratio", 1.0, "command", lambda s, c: s["command"]),
 }  # fmt: skip
 """Effects whose coefficient may vary, as terms of a balance."""
+LAW_OVER_TWO = "law over two"
+"""Kind of a law over two variables."""
 _VARIED_BY = ("position", "velocity", "command", "force", "pressure_head", "pressure_rod", "time")
 
 
@@ -159,7 +161,7 @@ class LawForm:
     @property
     def kind(self) -> str:
         """Whether it is a profile, or a law over one or two variables; the best of each kind is refined."""
-        return "profile" if self.effect else f"law over {len(self.table.variables)}"
+        return "profile" if self.effect else LAW_OVER_TWO if len(self.table.variables) > 1 else "law over one"
 
     @property
     def sides(self) -> tuple[tuple[str, float], ...]:
@@ -334,7 +336,8 @@ def place_knots(seen: Sequence[Seen], axis: str, count: int, smoothing: float) -
     """
     found = {}
     for name in OWN_VARIABLES:
-        if name not in seen[0].values[axis]:
+        # what varies with the time of one run alone may be anything
+        if name not in seen[0].values[axis] or (name == "time" and len(seen) < 2):
             continue
         x = np.concatenate([s.values[axis][name] for s in seen])
         x = x[np.isfinite(x)]

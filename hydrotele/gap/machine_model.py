@@ -89,9 +89,12 @@ class MachineModel(GapModel):
         try:
             kept = evidence.slopes(guess, evidence.errors(guess, COARSE), step=COARSE) if dense else None
             fit = evidence.fit(guess, 0.0, steps=4, step=MIDDLE, kept=kept)
-            added = fit.guess.parts[len(now.guess.parts) :]
-            if not np.isfinite(fit.loss) or any(is_irrelevant(h, d) for h, d in added):
+            count = len(now.guess.parts)
+            added = [part for part in fit.guess.parts[count:] if not is_irrelevant(*part)]
+            if not np.isfinite(fit.loss) or not added:
                 return None
+            if len(added) < len(guess.parts) - count:  # one effect of a pair is not there
+                fit = evidence.fit(Guess((*fit.guess.parts[:count], *added)), 0.0, steps=4, step=MIDDLE)
             evidence.set_base(now)
             if scale.residual == 1.0:
                 judged = evidence.judged(fit.guess)

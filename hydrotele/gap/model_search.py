@@ -22,7 +22,7 @@ from hydrotele.gap.backlash import BACKLASH
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.disturbances import is_pulse
 from hydrotele.gap.gap_model import GapModel, Linearisation
-from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior
+from hydrotele.gap.laws import LAW_OVER_TWO, LawForm, LawHypothesis, best_prior
 from hydrotele.gap.regression import (
     OWN_SCALE,
     LevelScale,
@@ -215,7 +215,9 @@ def add_effects(
         share = 0.05 + 0.8 * index / model.max_effects
         tell("compare effects", share)
         pool = [c for c in candidates if keys is None or c.key in keys]
-        proposals, varying = propose(model, now, [c for c in pool if not is_pulse(c)], quantities, effects, has_laws)
+        proposals, varying, compare_pairs = propose(
+            model, now, [c for c in pool if not is_pulse(c)], quantities, effects, has_laws
+        )
         proposals = sorted([*proposals, *propose_disturbances(model, now, candidates)], key=lambda p: -p.factor)
         first = first or tuple(proposals)
         kept = [p.key for p in proposals if not p.law][:_KEPT]
@@ -226,6 +228,10 @@ def add_effects(
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
             now = renew_noise(model, now, better)
+        if not better.charged_score < now.charged_score:
+            better = min(extensions(model, now, compare_pairs()), key=lambda m: m.charged_score, default=now)
+            if better.charged_score < now.charged_score:
+                now = renew_noise(model, now, better)
         if not better.charged_score < now.charged_score:
             better = min(search_directly(model, now, direct, tell), key=lambda m: m.charged_score, default=now)
         if not better.charged_score < now.charged_score:
@@ -355,7 +361,7 @@ def _settle_fit(model: GapModel, judged: Judged, wanted: float) -> Model:
 def propose(
     model: GapModel, now: Model, candidates: Sequence[Hypothesis], quantities: Mapping[str, Quantity] | None = None,
     effects: Collection[str] = (), has_laws: bool = False,
-) -> tuple[list[Proposal], list[Proposal]]:  # fmt: skip
+) -> tuple[list[Proposal], list[Proposal], Callable[[], list[Proposal]]]:  # fmt: skip
     """Rank effects, laws, and parameters that may differ between the runs, by their Bayes factors in the linear model.
 
     The density of the errors is known in closed form for every size of the residual inputs. An effect is proposed with
@@ -372,7 +378,8 @@ def propose(
 
     Returns:
         Perhaps a pair of effects, then one proposal per effect, and one of the calibration alone, the best first;
-        and one proposal per parameter that may differ, the best first.
+        and one proposal per parameter that may differ, the best first; and a function that compares the laws over two
+        variables, which take the most time and are the most flexible.
     """
     taken = {h.key for h in now.guess.hypotheses}
     versions = [v for c in candidates if c.key not in taken for v in list_versions(c)]
@@ -418,17 +425,22 @@ def propose(
     forms = table.list_laws(now.judged, effects, has_laws)
     compare_laws(forms)
     free = [form for form in forms if not form.effect and form.key in best]
-    if free:
-        compare_laws(table.list_pairs(max(free, key=lambda form: best[form.key].factor)))
+
+    def compare_pairs() -> list[Proposal]:
+        if free:
+            compare_laws(table.list_pairs(max(free, key=lambda form: best[form.key].factor)))
+        return sorted((p for p in best.values() if p.law and p.law.kind == LAW_OVER_TWO), key=lambda p: -p.factor)
+
     ranked, differing = (sorted(found.values(), key=lambda p: -p.factor) for found in (best, varying))
-    single = [p for p in ranked if p.key in chosen]
+    single = [p for p in ranked if p.key in chosen and p.factor > 0.0]
     if not single:
-        return ranked, differing
+        return ranked, differing, compare_pairs
     scale = single[0].scale
     pair = propose_pair(table, [chosen[p.key] for p in single[:_JOINT]], scale)
     if pair is None:
-        return ranked, differing
-    return [Proposal(pair[0], gains[scale] + pair[1] / table.fraction, scale), *ranked], differing
+        return ranked, differing, compare_pairs
+    joint = Proposal(pair[0], gains[scale] + pair[1] / table.fraction, scale)
+    return [joint, *ranked], differing, compare_pairs
 
 
 def _compare_columns(
@@ -436,7 +448,9 @@ def _compare_columns(
 ) -> Iterator[tuple[int, tuple[Hypothesis, np.ndarray], float]]:
     """Yield the place of each version, or of each law with each of its priors, its start, and twice its factor."""
     if not table.laws:
-        factors, means = compare_groups(terms.edges, marginal.right, marginal.blocks)
+        factors, means = compare_groups(
+            terms.edges, marginal.right, marginal.blocks, [v.bounds for v in table.versions]
+        )
         for index, (version, factor, mean) in enumerate(zip(table.versions, factors, means, strict=True)):
             yield index, (version.hypothesis, version.deviation(mean)), float(factor)
     for index, law in enumerate(table.laws):
@@ -484,7 +498,8 @@ def propose_pair(
         return None
     own = np.concatenate([np.arange(edges[g], edges[g + 1]) for g in leaders])
     width = np.array([0, len(own)])
-    factors, (mean,) = compare_groups(width, marginal.right[own], [gram[np.ix_(own, own)]])
+    bounds = np.vstack([chosen_versions[g].bounds for g in leaders])
+    factors, (mean,) = compare_groups(width, marginal.right[own], [gram[np.ix_(own, own)]], [bounds])
     split = np.split(mean, [edges[leaders[0] + 1] - edges[leaders[0]]])
     versions = [chosen_versions[g] for g in leaders]
     parts = tuple((v.hypothesis, v.deviation(m)) for v, m in zip(versions, split, strict=True))

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.optimize import lsq_linear
 
 from hydrotele.core.compiled import compiled
 
@@ -164,7 +165,7 @@ def split_columns(by_run: Sequence[NormalEquations], single: Sequence[int], nuis
 
 
 def compare_groups(
-    edges: np.ndarray, right: np.ndarray, blocks: Sequence[np.ndarray]
+    edges: np.ndarray, right: np.ndarray, blocks: Sequence[np.ndarray], bounds: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Compare every group alone with no group.
 
@@ -172,9 +173,11 @@ def compare_groups(
         edges: (G + 1,) first column of each group.
         right: (P,) X' W y.
         blocks: per group (p, p) X' W X.
+        bounds: per group (p, 2) of its coefficients; none by default.
 
     Returns:
-        (G,) twice the log Bayes factors, and the posterior means (p,) of the coefficients.
+        (G,) twice the log Bayes factors, and the most likely coefficients (p,). Within bounds the factor is that of
+        the posterior's density there, so that an effect of the wrong sign explains nothing.
 
     >>> factors, means = compare_groups(np.array([0, 1]), np.array([30.0]), [np.array([[9.0]])])
     >>> float(factors[0].round(3)), means[0]
@@ -185,7 +188,18 @@ def compare_groups(
         own = right[edges[g] : edges[g + 1]]
         factor = cho_factor(block + np.eye(len(block)), lower=True)
         mean = cho_solve(factor, own)
-        factors[g] = own @ mean - 2.0 * np.sum(np.log(np.diag(factor[0])))
+        if bounds is not None and np.any((mean < bounds[g][:, 0]) | (mean > bounds[g][:, 1])):
+            root = np.tril(factor[0])
+            low, high = bounds[g].T
+            # bounds that hold 0, with some room: the solver needs low < high
+            room = np.finfo(float).eps + np.zeros(len(mean))
+            mean = lsq_linear(
+                root.T, solve_triangular(root, own, lower=True), (np.minimum(low, -room), np.maximum(high, room)),
+                method="bvls",
+            ).x  # fmt: skip
+            mean = np.clip(mean, low, high)
+        gain = 2.0 * own @ mean - np.sum((np.tril(factor[0]).T @ mean) ** 2)
+        factors[g] = gain - 2.0 * np.sum(np.log(np.diag(factor[0])))
         means.append(mean)
     return factors, means
 
