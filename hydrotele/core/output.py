@@ -23,10 +23,10 @@ OUTPUT_FILES = {
     "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
     "gap": (
         "gap.json", "report.html", "recording.rrd", "next_experiment.yaml",
-        "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml",
-        "posterior.parquet", "posterior/machine.*", "posterior/machine_assets/*",
+        "patched/machine.*", "patched/machine_assets/*", "patched/effects.yaml", "patched/*.py",
+        "posterior.parquet", "posterior/machine.*", "posterior/machine_assets/*", "posterior/*.py",
     ),
-    "interim gap": ("gap.json", "interim.json", "machine.*", "machine_assets/*"),
+    "interim gap": ("gap.json", "interim.json", "machine.*", "machine_assets/*", "*.py"),
     "compare": ("compare.json", "*.png"),
     "contact": ("contact.json", "mask.csv", "*.parquet"),
     "robot calibration": ("calibration.json", "report.html", "*.png", "calibrated.yaml",

@@ -204,7 +204,9 @@ def find_gap(
     named = _named(found, spread, shares)
     named = tuple(with_profile(data.machine, e, profiles.get((e.name, e.location))) for e in named)
     left = left_over(before[0], after[0], data.channels, floor)
-    named = count_unexplained(named, learned, left, _lost(tests, learned))
+    named = count_unexplained(
+        named, learned, left, _lost(tests, learned), [run.name for run in (data.heldout, *data.fit)]
+    )
     size = GapSize(rms(before[:1]), rms(after[:1]), floor)
     # process noise may stand for what is missing
     bounded = dataclasses.replace(size, noise_floor=None) if judge.ripple else size

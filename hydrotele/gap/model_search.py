@@ -655,7 +655,8 @@ def exchange(
         same_size = [m for m in models if len(m.guess.parts) == len(rests)]
         if best is now and same_size and same_size[0].score < now.score:
             best = same_size[0]
-            models = [now, *(m for m in models if m is not best)]
+            new = keys_of(best) - keys_of(rest)  # a pair with the new effect is no rival of it
+            models = [now, *(m for m in models if m is not best and not keys_of(m) & new)]
             order = [*(k for k in order if k != index), index]  # the effect added last is the last part
         rivals.append(tuple(_rival(m, rest) for m in models))
     return best, [rests[k] for k in order], tuple(rivals[k] for k in order)

@@ -1,4 +1,4 @@
-"""Acceptance and verdict of the gap search by regression.
+"""Acceptance and verdict of the gap search.
 
 They follow from three things alone: the posterior of the effects, the held-out run (predictive likelihood and open-loop
 prediction), and residual tests of the final model.
@@ -98,7 +98,11 @@ def compare_held_out(evidence: Evidence, given: Judged, final: Judged) -> HeldOu
 
 
 def count_unexplained(
-    named: Sequence[NamedEffect], laws: Sequence[LearnedLaw], left: Mapping[str, float], lost: Collection[str]
+    named: Sequence[NamedEffect],
+    laws: Sequence[LearnedLaw],
+    left: Mapping[str, float],
+    lost: Collection[str],
+    runs: Collection[str] = (),
 ) -> tuple[NamedEffect, ...]:
     """Return the effects with probabilities that count what remains on their axes as "none of them".
 
@@ -111,9 +115,14 @@ def count_unexplained(
         laws: learned laws.
         left: axis -> fraction of its gap that remains, "" -> of all channels.
         lost: axes on which something remains, "" for channels without axis.
+        runs: names of the runs, which the location of an effect in one run contains.
     """
     found = []
     for effect in named:
+        part = effect.location.partition(".")[2]
+        if any(part == run or part.startswith(f"{run}.") for run in runs):  # no part of a law of all runs
+            found.append(effect)
+            continue
         place = effect.location.partition(".")[0]
         axis = place if place in left else ""
         if not lost or (axis and axis not in lost):
