@@ -95,7 +95,7 @@ def main() -> None:
         axis.barh([f"{s.hypothesis.name}, {s.hypothesis.location}" for s in ranked], [s.score for s in ranked])
         axis.invert_yaxis()
         axis.set(xlabel="estimated gain in 2 log evidence")
-        save(figure, "3_screening")
+        save(figure, "3_ranking")
 
         fits = sorted(fitted(evidence, base, ranked[:FITTED_EFFECTS]), key=lambda fit: -fit.score)
         figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
