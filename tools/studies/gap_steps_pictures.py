@@ -11,14 +11,14 @@ from pathlib import Path
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-from hydrotele.gap.screening import screen
 
 import hydrotele as ht
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.levels import smoothed_inputs
 from hydrotele.estimate.track import STEP, track_run
-from hydrotele.gap.calibrating import fitted
+from hydrotele.gap.machine_model import MachineModel
+from hydrotele.gap.model_search import Model, extensions, propose, settle, settle_noise
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "how_it_works"
 DEADBAND = 0.03  # of the simulated machine
@@ -29,7 +29,6 @@ COMMANDS = {  # valve commands at the times 0, 1, 2 ... s
 }
 CHANNEL = "length.slide"
 SHOWN_EFFECTS = 12
-FITTED_EFFECTS = 6
 
 
 def record_logs(folder: Path) -> None:
@@ -70,8 +69,9 @@ def main() -> None:
 
     evidence = Evidence(data, data.fit, 1, STEP, lacking=True)
     try:
-        base = evidence.judged(Guess())
-        evidence.set_base(base)
+        model = MachineModel(evidence)
+        given = Model(settle_noise(model, model.judge(Guess())))
+        base = given.judged
         track = next(t for t in base.tracks if t.run.name == run.name)
         inputs = smoothed_inputs(track)
         labels = {
@@ -90,20 +90,28 @@ def main() -> None:
         axes[-1, 0].set(xlabel="time [s]")
         save(figure, "2_residual_inputs")
 
-        ranked = screen(evidence, Guess(), hypotheses(data.machine))[:SHOWN_EFFECTS]
+        candidates = hypotheses(data.machine)
+        proposals, _ = propose(model, given, candidates, effects=[c.name for c in candidates])
+        single = [p for p in proposals if len(p.parts) == 1][:SHOWN_EFFECTS]
         figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
-        axis.barh([f"{s.hypothesis.name}, {s.hypothesis.location}" for s in ranked], [s.score for s in ranked])
+        axis.barh([", ".join(p.key) for p in single], [p.factor for p in single])
         axis.invert_yaxis()
-        axis.set(xlabel="estimated gain in 2 log evidence")
-        save(figure, "3_screening")
+        axis.set(xlabel="twice the log Bayes factor, linear model")
+        save(figure, "3_ranking")
 
-        fits = sorted(fitted(evidence, base, ranked[:FITTED_EFFECTS]), key=lambda fit: -fit.score)
+        fits = []
+        for found in extensions(model, given, proposals):
+            fits.append(settle(model, found))
+            model.set_base(given.judged)
+        fits.sort(key=lambda fit: fit.score)
         figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
-        names = [f"{fit.guess.hypotheses[-1].name}, {fit.guess.hypotheses[-1].location}" for fit in fits]
-        axis.barh(names, [fit.score for fit in fits])
+        names = [" and ".join(", ".join(h.key) for h in fit.guess.hypotheses) for fit in fits]
+        axis.barh(names, [given.score - fit.score for fit in fits])
         axis.invert_yaxis()
-        axis.set(xlabel="gain in 2 log evidence after the fit, with the noise levels of the given machine")
+        axis.set(xlabel="twice the log Bayes factor, after the fit")
         save(figure, "4_fits")
+        for name, fit in zip(names, fits, strict=True):
+            print(f"{name}: {given.score - fit.score:.1f}")
     finally:
         evidence.close()
 

@@ -5,8 +5,8 @@ The search's own `least` and `scale` play no part. Sources by letter:
 K  Khoshzaban 1992, through `models/cat215/machine.yaml` and its README: two printed closed lengths
    of the boom cylinder differ by 24 mm; resolver +-0.1 deg, length +-2 mm, pressure +-25 psi
    (172 kPa); backlash in the slew gear train (no size).
-V  the Volvo EC20 of `docs/validation/real_machines.md`: dead bands 14 and 16 % of the command,
-   command delay 0.12 s.
+V  the record of a Volvo EC20 in `docs/validation/real_machines.md`, from which dead bands of 14 and
+   16 % of the command and a command delay of 0.12 s were estimated.
 E  EMPS (Janot et al. 2019), the same page: friction asymmetry 0.14 (dry), -0.18 (viscous).
 B  Bonchis, Ha, Corke and Rye, Model-based friction compensation in hydraulic servo systems for
    mining technology, introduction: friction takes 10 to 15 % and up to 30 % of the force.
