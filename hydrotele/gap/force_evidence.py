@@ -672,10 +672,14 @@ class ForceEvidence(GapModel):
             interval=(start, end - start), choice_cost=_CHOICE_OF_INTERVAL,
         )  # fmt: skip
 
-    def search_directly(
+    def try_start_values(self, judged: Judged, candidates: Sequence[Hypothesis]) -> list[Judged]:
+        """Return none; the columns of forces need no start values."""
+        return []
+
+    def search_backlash(
         self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
     ) -> Judged | None:  # fmt: skip
-        """Return None; no effect of a mechanism needs it."""
+        """Return None; mechanisms have no backlash."""
         return None
 
     def propose_noise(self, judged: Judged, min_gain: float) -> Judged | None:

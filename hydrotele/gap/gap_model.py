@@ -181,10 +181,14 @@ class GapModel(Protocol):
         """
         return []
 
-    def search_directly(
+    def try_start_values(self, judged: Judged, candidates: Sequence[Hypothesis]) -> list[Judged]:
+        """Return a model with the effects whose start values improve it most, without the linear step."""
+        ...
+
+    def search_backlash(
         self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
     ) -> Judged | None:  # fmt: skip
-        """Return a model with an effect whose likelihood has many local optima; None if it does not help."""
+        """Return a model with backlash; None if nothing is missing there, or it does not help."""
         ...
 
     def select_priors(self, guess: Guess) -> Guess:

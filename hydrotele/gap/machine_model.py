@@ -12,11 +12,11 @@ from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged
 from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
-from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift
+from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift, track_run
 from hydrotele.gap.backlash import add_backlash, is_unexplained
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
-from hydrotele.gap.disturbances import compare_disturbances, list_disturbances
+from hydrotele.gap.disturbances import compare_disturbances, is_pulse, list_disturbances
 from hydrotele.gap.gap_model import GapModel
 from hydrotele.gap.laws import LawForm, LawHypothesis, best_prior, list_forms, list_pairs, states_after_rows
 from hydrotele.gap.regression import OWN_SCALE, RESIDUAL_SCALES, LevelScale, NormalEquations, reweight_columns
@@ -29,6 +29,7 @@ _REFINEMENT = 1.7  # factor on the best of them, both ways: half of their distan
 LINEAR_STEP_SECONDS = 12.0
 """Seconds of each run that the linear step uses; the refinement uses all."""
 _LEAST_GAIN = 0.01  # twice the log likelihood: parameters within a tenth of their standard deviations
+_STARTED = 2  # effects that are fitted from a start value in one round
 _MAX_EFFECTS = 8  # rounds, so that a search ends where no effect of the library is right
 
 
@@ -131,11 +132,42 @@ class MachineModel(GapModel):
             found += [(part, gained + f, scale) for part, f in compare_disturbances(tried, tracks, evidence.map)]
         return found
 
-    def search_directly(
+    def try_start_values(self, judged: Judged, candidates: Sequence[Hypothesis]) -> list[Judged]:
+        """Filter the run that fits worst with each start value of the effects that state some; judge the best ones.
+
+        A filter that believes late readings follows them, so the response of its errors to a delay has the wrong sign.
+        Here the filter has the effect, and no residual inputs, which would hide it.
+        """
+        evidence, levels = self.evidence, judged.tracks[0].levels
+        if not levels.inputs:
+            return []
+        machine, taken = judged.guess.machine(evidence.data.machine), {h.key for h in judged.guess.hypotheses}
+        worst = max(judged.tracks, key=lambda t: float(np.nanmean(t.whitened**2))).run
+        run = worst.select_rows(0, round(LINEAR_STEP_SECONDS / worst.period))
+        own = dataclasses.replace(levels, inputs=(), sizes=np.zeros(0))
+
+        def loss(start: tuple[Hypothesis, np.ndarray] | None) -> float:
+            changed = start[0].machine(machine, start[1]) if start else machine
+            return track_run(changed, evidence.data, run, None, evidence.step, own).loss
+
+        starts = [
+            (h, s) for h in candidates if h.key not in taken and not is_pulse(h) for s in h.starts if np.any(s)
+        ]  # fmt: skip
+        before, *losses = evidence.map(loss, [None, *starts])
+        best: dict[tuple[str, str], tuple[float, int]] = {}
+        for index, after in enumerate(losses):
+            if after < min(before, best.get(starts[index][0].key, (np.inf, 0))[0]):
+                best[starts[index][0].key] = after, index
+        chosen = [starts[index] for _, index in sorted(best.values())[:_STARTED]]
+        evidence.set_base(judged)
+        found = [evidence.judged(judged.guess.plus(*start), reopened=True) for start in chosen]
+        return [one for one in found if np.isfinite(one.loss)]
+
+    def search_backlash(
         self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]
     ) -> Judged | None:  # fmt: skip
         """Search backlash of an axis whose motion the model does not explain."""
-        if not is_unexplained(judged, effect.location):
+        if effect.key in {h.key for h in judged.guess.hypotheses} or not is_unexplained(judged, effect.location):
             return None
         tell(f"search for backlash of the {effect.location}", 0.7)
         return add_backlash(self.evidence, judged.guess, effect.location)

@@ -52,7 +52,7 @@ PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 _JOINT = 40  # best effects among which a pair is looked for
 _LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
-_TRIED = 4  # candidates that are refined in each round
+_TRIED = 8  # candidates that are refined in each round, each of another family
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
 _CLOSE = 100.0  # twice the log Bayes factor; a rival that stays farther behind is not fitted to the end
 _KEPT = 50  # effects that are linearised again after the first round
@@ -143,6 +143,11 @@ class Proposal:
         return first.form if isinstance(first, LawHypothesis) else None
 
     @property
+    def families(self) -> tuple[str, ...]:
+        """Families of the effects."""
+        return tuple(family_of(h.name) for h, _ in self.parts)
+
+    @property
     def key(self) -> tuple[str, str]:
         """Name and location of the first effect."""
         return self.parts[0][0].key if self.parts else (CALIBRATION, "all")
@@ -209,8 +214,8 @@ def add_effects(
     first = tuple[Proposal, ...]()
     keys: set[tuple[str, str]] | None = None
     rounds: list[Round] = []
-    direct = [c for c in candidates if is_direct(c)]
-    candidates = [c for c in candidates if not is_direct(c)]
+    direct = [c for c in candidates if c.name == BACKLASH]
+    candidates = [c for c in candidates if c.name != BACKLASH]
     for index in range(model.max_effects):
         share = 0.05 + 0.8 * index / model.max_effects
         tell("compare effects", share)
@@ -225,6 +230,8 @@ def add_effects(
         tell("refine the best effects", share + 0.03)
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
+        if not index:
+            others += search_directly(model, now, model.try_start_values(now.judged, candidates))
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
             now = renew_noise(model, now, better)
@@ -233,7 +240,9 @@ def add_effects(
             if better.charged_score < now.charged_score:
                 now = renew_noise(model, now, better)
         if not better.charged_score < now.charged_score:
-            better = min(search_directly(model, now, direct, tell), key=lambda m: m.charged_score, default=now)
+            started = model.try_start_values(now.judged, candidates) if index else []
+            started += [j for c in direct if (j := model.search_backlash(now.judged, c, tell)) is not None]
+            better = min(search_directly(model, now, started), key=lambda m: m.charged_score, default=now)
         if not better.charged_score < now.charged_score:
             break
         settled = compare_common_values(model, settle(model, better), candidates)
@@ -272,29 +281,17 @@ def compare_common_values(model: GapModel, now: Model, candidates: Sequence[Hypo
     return now
 
 
-def is_direct(effect: Hypothesis) -> bool:
-    """Return whether an effect is searched directly, because its likelihood has many local optima."""
-    return effect.name == BACKLASH
-
-
-def search_directly(model: GapModel, now: Model, effects: Sequence[Hypothesis], tell: Progress) -> list[Model]:
-    """Return the model with each of some effects that the errors suggest and that a direct search finds, fitted.
+def search_directly(model: GapModel, now: Model, found: Sequence[Judged]) -> list[Model]:
+    """Return models that were started beside the linear step, fitted.
 
     Args:
         model: whose base is `now`; it is the base afterwards, too.
         now: the model.
-        effects: with many local optima.
-        tell: called with (what is done, fraction done).
+        found: extensions of it.
     """
-    found = []
-    for effect in effects:
-        if effect.key in keys_of(now):
-            continue
-        judged = model.search_directly(now.judged, effect, tell)
-        if judged is not None:
-            found.append(compact(model, settle(model, Model(judged))))
-        model.set_base(now.judged)
-    return found
+    settled = [compact(model, settle(model, Model(judged))) for judged in found]
+    model.set_base(now.judged)
+    return settled
 
 
 def renew_noise(model: GapModel, now: Model, better: Model) -> Model:
@@ -520,7 +517,9 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 def extensions(model: GapModel, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
     """Refine the best proposals that the linear step holds for better than the model; all but the best are compact."""
     better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
-    chosen = [p for p in better if not p.law][:_TRIED]
+    # the linear step may rank one family far too low: residual inputs hide what a late sensor reads
+    families = {p.families: p for p in reversed(better) if not p.law}
+    chosen = sorted(families.values(), key=lambda p: -p.factor)[:_TRIED]
     laws = {p.law.kind: p for p in reversed(better) if p.law}
     chosen += laws.values()
     found: list[Model] = []
