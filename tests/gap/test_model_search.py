@@ -96,7 +96,7 @@ def test_a_custom_effect_is_found_whatever_its_start_value(monkeypatch):
     truth = _set_ripple(rig, "slide", {"force": 150.0, "length": 0.1})
     noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
     data = simulate_data(truth, channels, noise, model=rig, period=0.005, rows=1000, noise_stated=True)
-    gap = find_gap(data, effects=("ripple", "coulomb_friction"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("ripple", "coulomb_friction"), jobs=1)
     (found,) = gap.effects
     assert found.name == "ripple"
     assert found.parameters["length"].low < 0.1 < found.parameters["length"].high
@@ -135,7 +135,7 @@ def _rig_with_dead_band(rows):
 
 def test_a_dead_band_of_the_rig_is_found_with_its_size():
     data, true = _rig_with_dead_band(800)
-    gap = find_gap(data, effects=("valve_deadband", "command_delay", "payload"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("valve_deadband", "command_delay", "payload"), jobs=1)
     assert gap.verdict == "named"
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
     found = gap.effects[0].parameters["deadband"]
@@ -149,7 +149,7 @@ def test_a_dead_band_of_the_rig_is_found_with_its_size():
 
 @pytest.mark.nightly
 def test_a_dead_band_is_found_with_its_size(short_logs):
-    gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2, method="regression")
+    gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2)
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "stick")]
     # truth 0.085; a dead band is known to 0.001 even from half of the logs
     assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.003)
@@ -166,7 +166,7 @@ def test_a_machine_with_coloured_sensor_noise_has_no_gap():
     colours = {name: Colour(c, float(data.noise[c]), 0.04, 60.0) for c, name in enumerate(channels)}
     data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
     effects = ("coulomb_friction", "valve_deadband", "internal_leakage", "spool_lag", "pressure_lag")
-    gap = find_gap(data, effects=effects, jobs=1, method="regression")
+    gap = find_gap(data, effects=effects, jobs=1)
     assert gap.verdict == "no_gap"
     assert not gap.effects
     notes = [note for note in gap.notes if "resonance" in note]
@@ -182,7 +182,7 @@ def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, freq
     data, true = _rig_with_dead_band(1600)
     colours = {name: Colour(c, float(data.noise[c]), memory, frequency) for c, name in enumerate(data.channels)}
     data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
-    gap = find_gap(data, effects=("valve_deadband", "coulomb_friction", "command_delay"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("valve_deadband", "coulomb_friction", "command_delay"), jobs=1)
     assert gap.verdict == "named"
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
     found = gap.effects[0].parameters["deadband"]
@@ -196,7 +196,7 @@ def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, freq
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
     """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
     data = select_exciting_segments(load_dataset([MEASURED / "open_02"], load_machine("cat215")), 45.0)
-    gap = find_gap(data, effects=("coulomb_friction",), jobs=2, method="regression")
+    gap = find_gap(data, effects=("coulomb_friction",), jobs=2)
     assert gap.verdict == "named"
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("coulomb_friction_by_position", "stick")

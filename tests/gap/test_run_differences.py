@@ -81,7 +81,7 @@ def test_friction_that_differs_between_runs_is_found_and_transfers_to_another_ru
     viscous = rig.axes["slide"].cylinder.friction.viscous
     ratios = {"run_0": 1.35, "run_1": 0.7, "run_2": 1.05, "run_3": 1.3}
     own = [rig.replace("axes.slide.cylinder.friction.viscous", viscous * k) for k in ratios.values()]
-    gap = find_gap(_simulate(own, 350), effects=("viscous_friction",), jobs=1, method="regression")
+    gap = find_gap(_simulate(own, 350), effects=("viscous_friction",), jobs=1)
     assert gap.verdict == "no_gap"
     (difference,) = gap.differences
     assert difference.name == _VISCOUS
@@ -100,7 +100,7 @@ def test_an_effect_that_the_fitted_run_does_not_show_is_named_from_the_held_out_
     rough = rig.replace("axes.slide.cylinder.friction.viscous", 1.5 * rig.axes["slide"].cylinder.friction.viscous)
     data = _simulate([rough, rough])
     data = dataclasses.replace(data, fit=(data.fit[0].select_rows(0, 30),))  # 0.15 s
-    gap = find_gap(data, effects=("viscous_friction",), jobs=1, method="regression")
+    gap = find_gap(data, effects=("viscous_friction",), jobs=1)
     assert [(e.name, e.location) for e in gap.effects] == [("viscous_friction", "slide")]
     assert any("run_1 is held out in place of run_0" in note for note in gap.notes)
 
@@ -112,7 +112,7 @@ def test_a_pulse_in_one_run_is_named_and_one_in_the_held_out_run_is_reported(tmp
         for size, start in ((300.0, 1.2), (250.0, 0.8))
     ]
     data = _simulate([pulsed[0], rig, pulsed[1]])
-    gap = find_gap(data, effects=("viscous_friction", "force_pulse"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("viscous_friction", "force_pulse"), jobs=1)
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("force_pulse", "slide.run_2")
     for key, value in (("size", 250.0), ("start", 0.8), ("duration", 0.6)):
@@ -135,7 +135,7 @@ def test_a_periodic_force_has_a_phase_of_its_own_in_every_run():
         waves = {"cos(time, 0.37)": 100.0 * math.cos(phase), "sin(time, 0.37)": 100.0 * math.sin(phase)}
         term = Term(name="wave", axis="slide", balance="force", law="formula", parameters=waves)
         own.append(rig.model_copy(update={"terms": (term,)}))
-    gap = find_gap(_simulate(own, 800), effects=("force_pulse", "viscous_friction"), jobs=1, method="regression")
+    gap = find_gap(_simulate(own, 800), effects=("force_pulse", "viscous_friction"), jobs=1)
     assert gap.verdict == "named"
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("periodic_force", "slide")
