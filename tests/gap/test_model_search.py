@@ -1,6 +1,7 @@
 """The search by evidence: versions of an effect, residual inputs that are scaled, and one whole search."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,15 +9,16 @@ import pytest
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import all_axes
 from hydrotele.estimate.colour import Colour
-from hydrotele.estimate.evidence import Evidence, Fit
-from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.evidence import Evidence, Fit, Judged
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, Guess, Hypothesis, hypotheses
 from hydrotele.estimate.track import STEP
 from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.machine_model import scale_residual_inputs
-from hydrotele.gap.model_search import linear_factor
+from hydrotele.gap.model_search import Model, compare_common_values, linear_factor
 from hydrotele.gap.result import gap_document
+from hydrotele.gap.run_differences import between_runs, list_quantities
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
@@ -72,6 +74,62 @@ def test_the_factor_of_a_part_is_that_of_the_dense_gaussian():
         rest = [columns[k] for k in range(3) if k not in chosen]
         expected = 2.0 * (_log_density(errors, *columns) - _log_density(errors, *rest))
         assert linear_factor(fit, chosen) == pytest.approx(expected, abs=1e-9)  # rounding of a 40 x 40 determinant
+
+
+class _ValuePerRun:
+    """A model whose errors are how far the viscous friction of each run is from its true value."""
+
+    def __init__(self, machine, true):
+        self.machine, self.true, self.base = machine, true, None
+
+    def judge(self, guess, same=False, reopened=False):
+        found = [guess.machine(self.machine, run).axes["slide"].cylinder.friction.viscous for run in self.true]
+        errors = 0.1 * (np.array(found) - list(self.true.values()))  # known to 10 N s/m
+        tracks: Any = (_Uncoloured(),)
+        return Judged(guess, tracks, float(errors @ errors) + guess.prior)
+
+    def settle(self, judged, target):
+        self.base = judged
+        size = len(judged.guess.deviation)
+        return judged, Fit(judged.guess, judged.loss, 0.0, 0.0, np.eye(size))
+
+    def select_priors(self, guess):
+        return guess
+
+    def compact(self, judged):
+        return judged
+
+    def set_base(self, judged):
+        self.base = judged
+        return judged
+
+
+class _Uncoloured:
+    """A track without coloured noise."""
+
+    levels = type("Levels", (), {"colours": ()})()
+
+
+@pytest.mark.parametrize(("factors", "names"), [
+    ((1.4, 1.4, 1.4), ["viscous_friction"]),  # one wrong value
+    ((1.9, 2.5, 2.2), [BETWEEN_RUNS, "viscous_friction"]),
+    ((1.4, 0.6, 1.0), [BETWEEN_RUNS]),
+])  # fmt: skip
+def test_a_parameter_that_is_wrong_in_all_runs_becomes_an_effect(factors, names):
+    rig = load_machine("rig")
+    nominal = rig.axes["slide"].cylinder.friction.viscous
+    true = {f"run_{k}": nominal * factor for k, factor in enumerate(factors)}
+    effect = next(h for h in hypotheses(rig) if h.key == ("viscous_friction", "slide"))
+    quantity = list_quantities(rig, [effect])["viscous_friction.slide.viscous"]
+    group = between_runs(quantity, [*true, "held_out"], 1.0)
+    sizes = np.array([*true.values(), nominal]) - nominal
+    guess = Guess(((group, sizes / group.parameters["run_0"].prior_std),))
+    model: Any = _ValuePerRun(rig, true)
+    found = compare_common_values(model, Model(model.judge(guess)), [effect])
+    assert [h.name for h in found.guess.hypotheses] == names
+    assert model.base is found.judged or names == [BETWEEN_RUNS]
+    for run, value in true.items():
+        assert found.guess.machine(rig, run).axes["slide"].cylinder.friction.viscous == pytest.approx(value)
 
 
 def _set_ripple(machine, location, values):

@@ -12,7 +12,13 @@ from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.regression import NormalEquations, compare_groups, split_columns
 from hydrotele.gap.result import gap_document
-from hydrotele.gap.run_differences import between_runs, list_quantities, rescale_between_runs
+from hydrotele.gap.run_differences import (
+    between_runs,
+    common_value,
+    has_common_value,
+    list_quantities,
+    rescale_between_runs,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.gap_report import write_report
 from hydrotele.terms.term import Term
@@ -73,6 +79,33 @@ def test_a_machine_differs_only_in_the_run_of_the_parameter():
     found = [guess.machine(rig, run).axes["slide"].cylinder.friction.viscous for run in ("", "a", "b", "other")]
     assert found == pytest.approx([viscous, viscous + size, viscous - size, viscous])
     assert guess.parameter_runs == [("a",), ("b",)]
+
+
+@pytest.mark.parametrize(("values", "common"), [
+    ([1.3, 1.3, 1.3], True),
+    ([1.0, 1.3, 1.1], True),
+    ([1.3, -1.2, 0.1], False),
+    ([2.0, 0.1], False),  # two values: 95 % of Student's distribution are within 12.7 standard errors
+    ([1.3], False),  # one run says nothing about the scatter
+])  # fmt: skip
+def test_values_have_a_common_one_if_their_mean_is_significantly_nonzero(values, common):
+    assert has_common_value(np.array(values)) is common
+
+
+def test_values_of_runs_are_split_into_their_mean_and_the_differences_from_it():
+    """The machine of every run stays the same."""
+    rig, key = load_machine("rig"), ("viscous_friction", "slide")
+    effect = next(h for h in hypotheses(rig) if h.key == key)
+    group = between_runs(list_quantities(rig, [effect])[_VISCOUS], ["a", "b", "held_out"], 0.5)
+    deviation, size = np.array([1.0, 2.0, 0.3]), group.parameters["a"].prior_std
+    (own, start), (differing, moved) = common_value(effect, group, deviation)
+    assert own is effect and differing is group
+    assert effect.values(start)["viscous"] == pytest.approx(effect.parameters["viscous"].nominal + 1.5 * size)
+    assert moved == pytest.approx([-0.5, 0.5, 0.3])
+    before, after = Guess(((group, deviation),)), Guess(((own, start), (differing, moved)))
+    for run in ("a", "b"):
+        viscous = [g.machine(rig, run).axes["slide"].cylinder.friction.viscous for g in (before, after)]
+        assert viscous[1] == pytest.approx(viscous[0])
 
 
 def test_friction_that_differs_between_runs_is_found_and_transfers_to_another_run():
