@@ -6,19 +6,20 @@ The test rig has a dead band of 3 % where its model has 1 %, as in the tutorial 
 """
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-from hydrotele.gap.screening import screen
 
 import hydrotele as ht
 from hydrotele.estimate.evidence import Evidence
-from hydrotele.estimate.hypothesis import Guess, hypotheses
+from hydrotele.estimate.hypothesis import Guess, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import smoothed_inputs
 from hydrotele.estimate.track import STEP, track_run
-from hydrotele.gap.calibrating import fitted
+from hydrotele.gap.machine_model import MachineModel
+from hydrotele.gap.model_search import Model, Proposal, extensions, is_direct, propose, settle_noise
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "how_it_works"
 DEADBAND = 0.03  # of the simulated machine
@@ -29,7 +30,6 @@ COMMANDS = {  # valve commands at the times 0, 1, 2 ... s
 }
 CHANNEL = "length.slide"
 SHOWN_EFFECTS = 12
-FITTED_EFFECTS = 6
 
 
 def record_logs(folder: Path) -> None:
@@ -42,6 +42,20 @@ def record_logs(folder: Path) -> None:
         )
         keys = {"pilot": pilot, "effects": effect, "duration": "10", "control_rate": "200", "log_rate": "200"}
         ht.save_log(ht.run_scenario(ht.load_scenario("rig_steps", keys)).measured, folder / f"{run}.parquet")
+
+
+def label_of(proposal: Proposal) -> str:
+    """Return effect and location of a proposal."""
+    return ", ".join(proposal.key)
+
+
+def draw_bars(names: Sequence[str], factors: Sequence[float], height: float, label: str):
+    """Return a figure with a bar per effect."""
+    figure, axis = plt.subplots(figsize=(8, height), layout="constrained")
+    axis.barh(names, factors)
+    axis.invert_yaxis()
+    axis.set(xlabel=label)
+    return figure
 
 
 def save(figure, name: str) -> None:
@@ -70,9 +84,9 @@ def main() -> None:
 
     evidence = Evidence(data, data.fit, 1, STEP, lacking=True)
     try:
-        base = evidence.judged(Guess())
-        evidence.set_base(base)
-        track = next(t for t in base.tracks if t.run.name == run.name)
+        model = MachineModel(evidence)
+        given = Model(settle_noise(model, model.judge(Guess())))
+        track = next(t for t in given.judged.tracks if t.run.name == run.name)
         inputs = smoothed_inputs(track)
         labels = {
             "force": "force [N]",
@@ -90,20 +104,17 @@ def main() -> None:
         axes[-1, 0].set(xlabel="time [s]")
         save(figure, "2_residual_inputs")
 
-        ranked = screen(evidence, Guess(), hypotheses(data.machine))[:SHOWN_EFFECTS]
-        figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
-        axis.barh([f"{s.hypothesis.name}, {s.hypothesis.location}" for s in ranked], [s.score for s in ranked])
-        axis.invert_yaxis()
-        axis.set(xlabel="estimated gain in 2 log evidence")
-        save(figure, "3_screening")
+        candidates = model.prepare(limit_to_domain(hypotheses(data.machine), data.machine)[0], given.judged)
+        proposals, _ = propose(model, given, [c for c in candidates if not is_direct(c)])
+        single = [p for p in proposals if len(p.parts) == 1]
+        names, factors = [label_of(p) for p in single], [p.factor for p in single]
+        label = "twice the log Bayes factor, linear step"
+        save(draw_bars(names[:SHOWN_EFFECTS], factors[:SHOWN_EFFECTS], 4, label), "3_screening")
 
-        fits = sorted(fitted(evidence, base, ranked[:FITTED_EFFECTS]), key=lambda fit: -fit.score)
-        figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
-        names = [f"{fit.guess.hypotheses[-1].name}, {fit.guess.hypotheses[-1].location}" for fit in fits]
-        axis.barh(names, [fit.score for fit in fits])
-        axis.invert_yaxis()
-        axis.set(xlabel="gain in 2 log evidence after the fit, with the noise levels of the given machine")
-        save(figure, "4_fits")
+        models = sorted(extensions(model, given, single), key=lambda m: m.score)
+        names = [f"{h.name}, {h.location}" for m in models for h in m.guess.hypotheses[-1:]]
+        label = "twice the log Bayes factor after refinement"
+        save(draw_bars(names, [given.score - m.score for m in models], 2, label), "4_fits")
     finally:
         evidence.close()
 
