@@ -19,7 +19,7 @@ from hydrotele.estimate.hypothesis import Guess, hypotheses, limit_to_domain
 from hydrotele.estimate.levels import smoothed_inputs
 from hydrotele.estimate.track import STEP, track_run
 from hydrotele.gap.machine_model import MachineModel
-from hydrotele.gap.model_search import Model, Proposal, extensions, is_direct, propose, settle_noise
+from hydrotele.gap.model_search import Model, Proposal, extensions, is_direct, propose, settle, settle_noise
 
 OUT = Path(__file__).resolve().parents[2] / "docs" / "how_it_works"
 DEADBAND = 0.03  # of the simulated machine
@@ -111,7 +111,7 @@ def main() -> None:
         label = "twice the log Bayes factor, linear step"
         save(draw_bars(names[:SHOWN_EFFECTS], factors[:SHOWN_EFFECTS], 4, label), "3_screening")
 
-        models = sorted(extensions(model, given, single), key=lambda m: m.score)
+        models = sorted((settle(model, m) for m in extensions(model, given, single)), key=lambda m: m.score)
         names = [f"{h.name}, {h.location}" for m in models for h in m.guess.hypotheses[-1:]]
         label = "twice the log Bayes factor after refinement"
         save(draw_bars(names, [given.score - m.score for m in models], 2, label), "4_fits")
