@@ -251,17 +251,17 @@ def _squares(evidence: Evidence) -> float:
     return float(evidence.base_errors @ evidence.base_errors)
 
 
-def widened(guess: Guess, calibration: bool = False) -> Guess:
+def widened(guess: Guess) -> Guess:
     """A guess in which effects that stand at a bound have three times as much room.
 
-    A bound at zero is physical and stays. So do those of calibrated numbers unless asked for: what
-    a number takes beyond them may be an effect that is not tried yet.
+    A bound at zero is physical and stays. So do those of calibrated numbers: what a number takes beyond
+    them may be an effect that is not tried yet.
     """
     parts = []
     for hypothesis, deviation in guess.parts:
         table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
         for key, p in hypothesis.parameters.items():
-            if (hypothesis.name == CALIBRATION) != calibration:
+            if hypothesis.name == CALIBRATION:
                 continue
             if values[key] >= p.upper_bound:
                 table[key] = replace(p, upper_bound=p.nominal + _ROOM * (p.upper_bound - p.nominal))

@@ -11,7 +11,7 @@ import numpy as np
 from hydrotele.effects import EFFECTS
 from hydrotele.estimate.filter import SUPPLY, Input, input_units
 from hydrotele.gap.answer import base_effect
-from hydrotele.gap.law_tables import AHEAD, PLAYED, THROUGH, Learned, Memory
+from hydrotele.gap.law_tables import THROUGH, Learned
 from hydrotele.gap.result import (
     LIKELY,
     SURE,
@@ -29,13 +29,8 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.table import SWITCH
 from hydrotele.terms.term import DRIVE_VARIABLES
 
-_PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play
-_FRONT_WORDS = {
-    "": "", _PLAYED: "backlash output of the ", _AHEAD: "backlash difference of the ",
-}  # fmt: skip
 _PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
 _SIDES = {"head": "head side", "rod": "rod side"}
 _COUNTS = ("no place", "one place", "two places", "three places", "four places")
@@ -101,20 +96,17 @@ def channel_words(channel: str) -> str:
 def variable_words(variable: str) -> str:
     """A variable of a learned law in plain words.
 
-    >>> variable_words("pressure_rod.swing"), variable_words("played velocity")
-    ('rod side pressure of the swing', 'backlash output of the velocity')
+    >>> variable_words("pressure_rod.swing")
+    'rod side pressure of the swing'
     """
     name, _, axis = variable.partition(".")
-    front = next((front for front in (_PLAYED, _AHEAD) if name.startswith(front)), "")
-    plain = name.removeprefix(front)
-    words = _FRONT_WORDS[front] + _VARIABLES.get(plain, plain.replace("_", " "))
+    words = _VARIABLES.get(name, name.replace("_", " "))
     return f"{words} of the {axis}" if axis else words
 
 
 def learned_words(
-    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str,
-    other: str = "", when: str = "",
-) -> str:  # fmt: skip
+    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str, other: str = ""
+) -> str:
     """What a learned law does, in a sentence or two.
 
     >>> learned_words("force", "boom", "position", 9e3, "N", "", "velocity.swing")
@@ -124,32 +116,14 @@ def learned_words(
     if other:
         how += f" and the {variable_words(other)}"
     how = how.replace("the position", "position").replace("the time", "time")
-    how += f", {when}" if when else ""
     text = f"{_capital(_LACKS[balance].format(axis=axis))}, {amount(size, unit)} RMS, {how}."
     return f"{text} It resembles {resembles.replace('_', ' ')}." if resembles else text
-
-
-def memory_words(memory: Memory, unit: str) -> str:
-    """What a learned law remembers, in a few words.
-
-    >>> memory_words(Memory(1, "velocity", 0.0, 0.02), "m/s")
-    'with a backlash of 20 mm/s half width in the velocity'
-    >>> memory_words(Memory(SWITCH, "pressure_rod.boom", 8e6, 1.2e7), "Pa")
-    'switched on when the rod side pressure of the boom is above 12 MPa, and off below 8 MPa'
-    """
-    what, first = variable_words(memory.variable), amount(memory.end, unit)
-    if memory.way != SWITCH:
-        return f"with a backlash of {first} half width in the {what}"
-    ways = ("above", "below") if memory.end > memory.begin else ("below", "above")
-    last = amount(memory.begin, unit)
-    return f"switched on when the {what} is {ways[0]} {first}, and off {ways[1]} {last}"
 
 
 def learned_title(law: LearnedLaw) -> str:
     """On what a learned law acts and on what it depends, in a few words."""
     what = _LACKS[law.balance].format(axis=law.axis).partition(" ")[2]
     where = f", at the median {variable_words(law.other)}" if law.other else ""
-    where += f", {law.memory}" if law.memory else ""
     return _capital(f"{what} over {variable_words(law.variable)}{where}")
 
 
@@ -529,39 +503,26 @@ def learned_laws(
 
 def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
     """A law along its (first) variable, with the other variable at its median."""
-    table, seen = law.table, dict(law.seen)
-    seen |= table.memory.seen(seen) if table.memory else {}
+    table, seen = law.table, law.seen
     variable, other = table.variables[0], table.variables[1] if len(table.variables) > 1 else ""
     points = np.unique(np.quantile(seen[variable], np.linspace(0.01, 0.99, _POINTS)))
     probe = {variable: points}
     if other:
         probe[other] = np.full(len(points), float(np.median(seen[other])))
-    if table.window:
-        probe["time"] = np.full(len(points), sum(table.window) / 2.0)
-    columns = table._replace(memory=None).columns(probe)
+    columns = table.columns(probe)
     error = np.sqrt(np.maximum(np.einsum("pk,kl,pl->p", columns, law.covariance, columns), 0.0))
     along = table.columns(law.seen) @ law.entries
     balance = "flow_head" if law.balance == THROUGH else law.balance
     (unit,) = input_units(machine, [Input(balance, law.axis)])
-    resembles = "" if table.of or table.window or table.memory else _resembles(law, along)
-    if table.memory:
-        names = {PLAYED: _PLAYED + table.memory.variable, AHEAD: _AHEAD + table.memory.variable}
-        variable, other = (names.get(v, v) for v in (variable, other))
-    when = "from {:.3g} to {:.3g} s".format(*table.window) if table.window else ""
-    memory = ""
-    if table.memory:
-        memory = memory_words(table.memory, variable_unit(machine, law.axis, table.memory.variable))
-        when = " and ".join([memory, *([when] if when else [])])
+    resembles = "" if table.of else _resembles(law, along)
     size = float(np.sqrt(np.mean(along**2)))
     if law.balance == SUPPLY:
         variable, other = (_with_axis(v, law.axis) for v in (variable, other))
     return LearnedLaw(
         law.balance, law.axis, _formula(law),
-        learned_words(
-            law.balance, law.axis, variable, size, unit, resembles, other, when
-        ),
+        learned_words(law.balance, law.axis, variable, size, unit, resembles, other),
         resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
-        tuple(error.tolist()), unit, variable_unit(machine, law.axis, variable), share, other, memory,
+        tuple(error.tolist()), unit, variable_unit(machine, law.axis, variable), share, other,
     )  # fmt: skip
 
 
@@ -578,17 +539,10 @@ def _formula(law: Learned) -> str:
     table = law.table
     if len(table.variables) == 1:
         pairs = ", ".join(f"{x:.3g}: {y:.3g}" for x, y in zip(table.points[0], law.entries, strict=True))
-        text = f"linear_table({table.variables[0]}; {pairs})"
-    else:
-        ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
-                for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
-        text = f"bilinear_table({'; '.join(ways)})"
-    if table.memory:
-        ((kind, facts),) = table.memory.facts.items()
-        facts = {**facts, "variable": table.memory.variable}
-        told = ", ".join(f"{k} {v:.4g}" for k, v in facts.items() if k != "variable")
-        text += f" {kind}({facts['variable']}, {told})"
-    return text + (" from {:.4g} to {:.4g} s".format(*table.window) if table.window else "")
+        return f"linear_table({table.variables[0]}; {pairs})"
+    ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
+            for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
+    return f"bilinear_table({'; '.join(ways)})"
 
 
 def _turns(machine: Machine, axis: str) -> bool:
@@ -598,7 +552,7 @@ def _turns(machine: Machine, axis: str) -> bool:
 
 def variable_unit(machine: Machine, own_axis: str, variable: str) -> str:
     """SI unit of a law's variable; `own_axis` is that of the law."""
-    name, _, axis = variable.removeprefix(_PLAYED).removeprefix(_AHEAD).partition(".")
+    name, _, axis = variable.partition(".")
     length = "rad" if _turns(machine, axis or own_axis) else "m"
     if name == "force":
         return "N m" if length == "rad" else "N"

@@ -135,8 +135,6 @@ class LearnedLaw:
         variable_unit: of the points.
         share: of the gap on the held-out run that it closes.
         other: a second variable on which it depends, at its median in `values`; or empty.
-        memory: a play or a switch in words, or empty; `values` are those beyond a play, and of a
-            switch those while it is on.
     """
 
     balance: str
@@ -152,7 +150,6 @@ class LearnedLaw:
     variable_unit: str
     share: float = math.nan
     other: str = ""
-    memory: str = ""
 
 
 @dataclass(frozen=True)
@@ -519,8 +516,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         - `learned`: laws learned from the data: `balance` (force, flow_head, flow_rod, flow_through,
           flow_supply, command), `axis`, `variable`, `other` (a second variable, or empty), `formula`
           in SI, `points` [`variable_unit`], `values` there and their standard deviations `spread`
-          [`unit`], `resembles` (a library effect or null), `share`, `memory` (backlash operator or relay
-          in words, or empty), `description`.
+          [`unit`], `resembles` (a library effect or null), `share`, `description`.
         - `unknown`: the part of the gap that no effect explains, or null: `law`, `channel`, `depends_on`,
           `windows` [s], `description`.
         - `lacks`: residual inputs of the patched machine: `balance`, `axis`, standard deviation `size`

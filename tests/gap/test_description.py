@@ -59,11 +59,6 @@ def test_a_law_of_two_variables_is_shown_at_the_median_of_the_second():
     assert told.depends_on == ("position.boom", "velocity.swing")
 
 
-def test_a_law_that_acts_for_a_while_says_when():
-    found = learned(Table(("position",), ((0.3, 0.7),), (4.0, 9.5)), [1.0, 2.0])
-    assert "from 4 to 9.5 s" in found.description and "from 4 to 9.5 s" in found.formula
-
-
 def predictions(loud):
     """White errors at 50 Hz, and ten times as large in a channel over some seconds."""
     time = 0.02 * np.arange(1000)
