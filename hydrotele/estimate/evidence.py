@@ -442,14 +442,6 @@ class Evidence:
         changes = self.map(change, list(moves.T)) if parallel else [change(way) for way in moves.T]
         return (np.linalg.pinv(moves.T) @ np.array(changes)).T
 
-    def base_slopes_of(self, tracks: Sequence[Track]) -> np.ndarray:
-        """(E, P) slopes of the base in some of its tracks, or in the first rows of them."""
-        whole, parts, at = self.base_slopes(self.slope_step), {}, 0
-        for track in self.tracks:
-            parts[track.run.name] = whole[at : at + track.whitened.size]
-            at += track.whitened.size
-        return np.concatenate([parts[t.run.name][: t.whitened.size] for t in tracks])
-
     def fit(
         self, guess: Guess, before: float, parallel: bool = True, steps: int = _STEPS,
         step: float | None = None, kept: np.ndarray | None = None,

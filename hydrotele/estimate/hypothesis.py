@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from hydrotele.logs.dataset import Dataset
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
-WIDE = 0.3  # of it: for a first look, where friction that sticks or slips makes slopes steep
 _SMOOTH = ("timing", "sensor")  # laws whose effects have a slope at nominal, besides their starts
 _OPEN = ("force", "flow", "valve", "supply")  # laws of which no drawing and no data sheet tells all
 _FREEDOM = 4.0  # degrees of freedom of the t distribution of their effects' sizes

@@ -54,7 +54,6 @@ class FreeCalibration:
         numbers: such as `linkage.stick.base` or `flow_table.boom.positive_50`, the opening at 50 %
             travel beyond the dead band; ratios to the given machine where no unit fits.
         note: one sentence on what stretches that were left out say.
-        seconds: length of the free runs [s].
         guess: the fitted parameters, as changes of the given machine.
         covariance: (P, P) of their normalised deviations.
     """
@@ -62,7 +61,6 @@ class FreeCalibration:
     machine: Machine
     numbers: dict[str, Estimate]
     note: str
-    seconds: float
     guess: Guess
     covariance: np.ndarray
 
@@ -99,7 +97,7 @@ def calibrate_freely(
         f" In cross-validation over intervals of {seconds:g} s, the errors decrease by: {closer}."
     )
     numbers = _numbers(data.machine, fit)
-    return FreeCalibration(_told(data.machine, fit), numbers, note, seconds, fit.guess, fit.covariance)
+    return FreeCalibration(_told(data.machine, fit), numbers, note, fit.guess, fit.covariance)
 
 
 def _seconds(run: RunData) -> float:
@@ -251,17 +249,17 @@ def _squares(evidence: Evidence) -> float:
     return float(evidence.base_errors @ evidence.base_errors)
 
 
-def widened(guess: Guess, calibration: bool = False) -> Guess:
+def widened(guess: Guess) -> Guess:
     """A guess in which effects that stand at a bound have three times as much room.
 
-    A bound at zero is physical and stays. So do those of calibrated numbers unless asked for: what
-    a number takes beyond them may be an effect that is not tried yet.
+    A bound at zero is physical and stays. So do those of calibrated numbers: what a number takes beyond
+    them may be an effect that is not tried yet.
     """
     parts = []
     for hypothesis, deviation in guess.parts:
         table, values = dict(hypothesis.parameters), hypothesis.values(deviation)
         for key, p in hypothesis.parameters.items():
-            if (hypothesis.name == CALIBRATION) != calibration:
+            if hypothesis.name == CALIBRATION:
                 continue
             if values[key] >= p.upper_bound:
                 table[key] = replace(p, upper_bound=p.nominal + _ROOM * (p.upper_bound - p.nominal))

@@ -105,9 +105,8 @@ def variable_words(variable: str) -> str:
 
 
 def learned_words(
-    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str,
-    other: str = "",
-) -> str:  # fmt: skip
+    balance: str, axis: str, variable: str, size: float, unit: str, resembles: str, other: str = ""
+) -> str:
     """What a learned law does, in a sentence or two.
 
     >>> learned_words("force", "boom", "position", 9e3, "N", "", "velocity.swing")
@@ -504,7 +503,7 @@ def learned_laws(
 
 def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
     """A law along its (first) variable, with the other variable at its median."""
-    table, seen = law.table, dict(law.seen)
+    table, seen = law.table, law.seen
     variable, other = table.variables[0], table.variables[1] if len(table.variables) > 1 else ""
     points = np.unique(np.quantile(seen[variable], np.linspace(0.01, 0.99, _POINTS)))
     probe = {variable: points}
@@ -521,9 +520,7 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
         variable, other = (_with_axis(v, law.axis) for v in (variable, other))
     return LearnedLaw(
         law.balance, law.axis, _formula(law),
-        learned_words(
-            law.balance, law.axis, variable, size, unit, resembles, other
-        ),
+        learned_words(law.balance, law.axis, variable, size, unit, resembles, other),
         resembles, variable, tuple(points.tolist()), tuple((columns @ law.entries).tolist()),
         tuple(error.tolist()), unit, variable_unit(machine, law.axis, variable), share, other,
     )  # fmt: skip
@@ -542,12 +539,10 @@ def _formula(law: Learned) -> str:
     table = law.table
     if len(table.variables) == 1:
         pairs = ", ".join(f"{x:.3g}: {y:.3g}" for x, y in zip(table.points[0], law.entries, strict=True))
-        text = f"linear_table({table.variables[0]}; {pairs})"
-    else:
-        ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
-                for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
-        text = f"bilinear_table({'; '.join(ways)})"
-    return text
+        return f"linear_table({table.variables[0]}; {pairs})"
+    ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
+            for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
+    return f"bilinear_table({'; '.join(ways)})"
 
 
 def _turns(machine: Machine, axis: str) -> bool:

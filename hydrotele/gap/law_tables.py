@@ -1,4 +1,4 @@
-"""Tables over one or two variables, linear in between: the form of a learned law and of a varying coefficient."""
+"""Forms that a learned law can have: a table over one or two variables, linear in between."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +20,8 @@ class Table(NamedTuple):
     """A form that a law can have: entries at points of one or two variables.
 
     Attributes:
-        variables: one or two of a drive's state; those of another drive with its axis, such as `velocity.swing`.
+        variables: one or two of a drive's state; those of another drive with its axis, such as
+            `velocity.swing`.
         points: rising points of each [its unit].
     """
 
@@ -44,29 +45,33 @@ class Table(NamedTuple):
 
     def columns(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """(n, K) shares of the entries along a run; row by row they add to 1."""
+        entries, weights = self.weights(values)
+        found = np.zeros((len(entries), self.size))
+        np.put_along_axis(found, entries, weights, axis=1)
+        return found
+
+    def weights(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 2) or (n, 4) entries that have a share in a row of a run, and these shares."""
         entries, weights = _weights(values[self.variables[0]], self.points[0])
         if len(self.variables) == 2:
             across, shares = _weights(values[self.variables[1]], self.points[1])
             entries = entries[:, :, None] * len(self.points[1]) + across[:, None]
             weights = weights[:, :, None] * shares[:, None]
             entries, weights = entries.reshape(len(across), -1), weights.reshape(len(across), -1)
-        found = np.zeros((len(entries), self.size))
-        np.put_along_axis(found, entries, weights, axis=1)
-        return found
+        return entries, weights
 
     def law(self, entries: np.ndarray) -> dict[str, Any]:
         """Law, parameters and variables of a term with some entries (K,)."""
         plain, points = [v.partition(".")[0] for v in self.variables], self.points
-        where = {"variables_from": self.of}
         if len(plain) == 1:
             table = {"variable": plain[0], "points": points[0], "values": tuple(entries.tolist())}
-            return {"law": "linear_table", "parameters": table, **where}
+            return {"law": "linear_table", "parameters": table, "variables_from": self.of}
         rows = entries.reshape(len(points[0]), -1)
         table = {
             "row_variable": plain[0], "column_variable": plain[1], "row_points": points[0],
             "column_points": points[1], "values": tuple(tuple(row) for row in rows.tolist()),
         }  # fmt: skip
-        return {"law": "bilinear_table", "parameters": table, **where}
+        return {"law": "bilinear_table", "parameters": table, "variables_from": self.of}
 
 
 @dataclass(frozen=True)

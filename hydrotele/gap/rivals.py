@@ -120,20 +120,18 @@ def effect_probabilities(now: Judged, cost: float, rest: Judged, rivals: Sequenc
 TOLD = 9.0  # square of an effect's deviation over its uncertainty: three standard deviations
 
 
-def part_taken(rest: Judged, judged: Judged, saved: float = 0.0) -> float:
+def part_taken(rest: Judged, judged: Judged) -> float:
     """Share of what a guess lacks that one with more takes of it.
 
     Args:
         rest: the guess.
         judged: the one with more.
-        saved: what the guess costs beside its loss, and the other one does not.
 
     Returns:
         1 where nothing is lacking any more, see `undisturbed_loss`.
     """
     ideal = min(sum(map(undisturbed_loss, judged.tracks)), judged.loss)
-    whole = rest.loss + saved
-    return (whole - judged.loss) / max(whole - ideal, 1.0)
+    return (rest.loss - judged.loss) / max(rest.loss - ideal, 1.0)
 
 
 def moved_last(information: np.ndarray, guess: Guess, index: int) -> np.ndarray:

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.effects import apply_effect
+from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
@@ -113,3 +113,18 @@ def test_supply_stops_at_its_relief_setting_and_pump_flow():
     supply, flow = flows(weak, 1.0)
     assert flow == pytest.approx(1e-3, rel=1e-9) and supply < 28e6
     assert flows(NOMINAL, 1.0)[1] > 2e-3
+
+
+def test_the_viscosity_of_the_oil_acts_on_all_drives():
+    """Viscous friction is proportional to the viscosity, laminar leakage to its reciprocal."""
+    ratio = 0.7
+    warm = apply_effect(NOMINAL, "oil_viscosity", "all", {"ratio": ratio})
+    for name, axis in NOMINAL.axes.items():
+        viscous, leakage = axis.drive.friction.viscous, axis.hydraulic_drive.leakage
+        assert viscous > 0.0 and leakage > 0.0
+        assert warm.axes[name].drive.friction.viscous == pytest.approx(ratio * viscous)
+        assert warm.axes[name].hydraulic_drive.leakage == pytest.approx(leakage / ratio)
+    same = apply_effect(warm, "oil_viscosity", "all", {"ratio": 1.0})
+    assert same == warm, "a ratio is relative to the given machine"
+    emps = load_machine("emps")  # no oil
+    assert EFFECTS["oil_viscosity"].locations(emps) == ()

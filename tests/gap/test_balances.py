@@ -1,6 +1,5 @@
 """Balances are at their noise where the model holds and stand out in the law that was changed."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -13,11 +12,9 @@ from hydrotele.estimate.reduced_model import (
     predicted_channels,
     read_channels,
     reduced_model,
-    state_names,
     state_size,
 )
-from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
-from hydrotele.gap.law_tables import Table, lack_regression
+from hydrotele.gap.balances import _balances, peak_lag, read_signals, window_lags
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
 from hydrotele.machine.log_channels import default_channel_unit
@@ -25,8 +22,6 @@ from hydrotele.machine.machine import get_sensor_set, reading_noise_rms
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.machine.sensors import SensorError
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.terms.term import Term
-from tests.estimate.test_filter import machine_data
 from tests.measured import MEASURED
 
 SENSORS, PERIOD = "khoshzaban1992", 0.02
@@ -65,6 +60,11 @@ def recorded(machine, seconds=20.0, seed=0):
 @functools.cache
 def clean_log():
     return recorded(load_machine("cat215"))
+
+
+def balances(machine, log, sensors):
+    """Law -> axis -> balance of a log."""
+    return _balances(machine, read_signals(machine, log, sensors))
 
 
 def judged(machine, log, sensors=SENSORS):
@@ -272,46 +272,3 @@ def test_the_delay_of_open_03_is_read_off_in_seconds():
     found = balances(load_machine("cat215"), log, SENSORS)["timing"]
     for axis in ("swing", "boom", "stick"):
         assert np.nanmedian(found[axis].residual) == pytest.approx(0.06, abs=0.01)
-
-
-@pytest.mark.parametrize("slow", [False, True])
-def test_what_a_pump_lacks_is_read_off_where_it_is_short(slow):
-    nominal = load_machine("cat215")
-    if slow:
-        nominal = with_value(nominal, "supply.time_constant", 0.1)
-    nominal = with_value(nominal, "supply.pump_flow", 0.6 * nominal.supply.pump_flow)
-    law = {"velocity": 4.0e-3}
-    term = Term(name="more", axis="boom", balance="flow_supply", law="formula", parameters=law,
-                variables_from={"velocity": "swing"})  # fmt: skip
-    data, states = machine_data(nominal, nominal.model_copy(update={"terms": (term,)}))
-    run, swing = data.heldout, state_names(nominal).index("rate.swing")
-    lack, deviation = pump_lack(nominal, data, run, data.noise)
-    short = np.isfinite(lack)
-    assert 50 < np.count_nonzero(short) < len(lack)
-    hidden = law["velocity"] * states[short, swing]
-    assert np.std(hidden) > 5.0 * np.median(deviation[short])
-    left = (lack[short] - hidden) / np.std(hidden)
-    assert np.median(np.abs(left)) < 0.1  # smoothing errs more where the pump begins to be short
-    along = states[short, swing]
-    table = Table(("velocity",), (tuple(np.linspace(along.min(), along.max(), 5).tolist()),))
-    shares = table.columns({"velocity": along})
-    found, share = lack_regression(table, [(lack[short], deviation[short], shares)])
-    assert share > 0.8 and found.predicted > 0.0
-    assert np.median(np.abs(shares @ found.entries - hidden)) < 0.1 * np.std(hidden)
-
-
-def test_a_pump_lacks_nothing_that_cannot_be_read():
-    nominal = load_machine("cat215")
-    data, _ = machine_data(nominal, nominal)
-    kept = [k for k, c in enumerate(data.channels) if c != "pressure_supply"]
-    run = dataclasses.replace(data.heldout, reading=data.heldout.reading[:, kept])
-    less = dataclasses.replace(data, channels=tuple(data.channels[k] for k in kept))
-    lack, _ = pump_lack(nominal, less, run, data.noise[kept])
-    assert np.isnan(lack).all()
-    lack, deviation = pump_lack(nominal, data, data.heldout, data.noise)
-    short = np.isfinite(lack)
-    assert not short.any() or np.median(np.abs(lack[short])) < 3.0 * np.median(deviation[short])
-    senses = with_value(nominal, "supply.kind", "load_sensing")  # a load that swings is no short flow
-    data, _ = machine_data(senses, senses)
-    lack, _ = pump_lack(senses, data, data.heldout, data.noise)
-    assert np.count_nonzero(np.isfinite(lack)) <= 2  # of 600: the first rows are a start

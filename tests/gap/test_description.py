@@ -1,13 +1,10 @@
 """A learned law as curve, formula and words; what is left, located."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
-from hydrotele.estimate.hypothesis import Guess, Hypothesis
+from hydrotele.estimate.hypothesis import Hypothesis
 from hydrotele.gap.description import describe, learned_laws
-from hydrotele.gap.discover import Discovery, Learned
-from hydrotele.gap.law_tables import Table
+from hydrotele.gap.law_tables import Learned, Table
 from hydrotele.gap.result import Lack, Prediction
 from hydrotele.machine.machine_file import load_machine
 
@@ -26,15 +23,8 @@ def learned(table, entries, balance="force", axis="boom", covariance=None):
     """The description of a law with these entries, each known to 1 N or so."""
     hypothesis = Hypothesis(f"learned_{balance}", f"{axis}.x", {}, lambda m, _: m)
     covariance = np.eye(len(entries)) if covariance is None else covariance
-    law = Learned(
-        hypothesis, balance, axis, table, np.array(entries, float), covariance, 1.0, 1.0,
-        _SMOOTHING, SEEN,
-    )  # fmt: skip
-    guess = Guess(((hypothesis, np.zeros(0)),))
-    (found,) = learned_laws(
-        Discovery(SimpleNamespace(guess=guess), (law,)), load_machine("cat215"),
-        {hypothesis.key: 0.4},
-    )  # fmt: skip
+    law = Learned(hypothesis, balance, axis, table, np.array(entries, float), covariance, _SMOOTHING, SEEN)
+    (found,) = learned_laws([law], load_machine("cat215"), {hypothesis.key: 0.4})
     return found
 
 
@@ -67,11 +57,6 @@ def test_a_law_of_two_variables_is_shown_at_the_median_of_the_second():
     assert "varies with position and the velocity of the swing" in found.description
     told = describe((), (found,), [predictions((6.0, 9.0))])
     assert told.depends_on == ("position.boom", "velocity.swing")
-
-
-def test_a_law_that_acts_for_a_while_says_when():
-    found = learned(Table(("position",), ((0.3, 0.7),), (4.0, 9.5)), [1.0, 2.0])
-    assert "from 4 to 9.5 s" in found.description and "from 4 to 9.5 s" in found.formula
 
 
 def predictions(loud):

@@ -87,6 +87,9 @@ def test_what_a_model_lacks_is_not_taken_for_jitter(truth, tmp_path, name, place
 
 
 @pytest.mark.nightly
+@pytest.mark.xfail(
+    strict=True, reason="jitter is estimated once, with the given machine (docs/gap_method.md, section 8)"
+)
 def test_jitter_that_another_lack_hides_is_found_with_it(truth, tmp_path):
     """An angle delay of 150 ms, which the given machine has, hides the jitter."""
     wrong = apply_effect(load_machine("cat215"), "angle_delay", "boom", {"delay": 0.15})

@@ -1,6 +1,7 @@
 """The search by evidence: versions of an effect, residual inputs that are scaled, and one whole search."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,15 +9,16 @@ import pytest
 from hydrotele.effects import EFFECTS, Effect, Parameter
 from hydrotele.effects.effect import all_axes
 from hydrotele.estimate.colour import Colour
-from hydrotele.estimate.evidence import Evidence, Fit
-from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
+from hydrotele.estimate.evidence import Evidence, Fit, Judged
+from hydrotele.estimate.hypothesis import BETWEEN_RUNS, Guess, Hypothesis, hypotheses
 from hydrotele.estimate.track import STEP
 from hydrotele.gap.answer import Answer, Explanation
 from hydrotele.gap.dictionary import list_versions
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.machine_model import scale_residual_inputs
-from hydrotele.gap.model_search import linear_factor
+from hydrotele.gap.model_search import Model, compare_common_values, linear_factor
 from hydrotele.gap.result import gap_document
+from hydrotele.gap.run_differences import between_runs, list_quantities
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.dataset_reduction import select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
@@ -74,6 +76,62 @@ def test_the_factor_of_a_part_is_that_of_the_dense_gaussian():
         assert linear_factor(fit, chosen) == pytest.approx(expected, abs=1e-9)  # rounding of a 40 x 40 determinant
 
 
+class _ValuePerRun:
+    """A model whose errors are how far the viscous friction of each run is from its true value."""
+
+    def __init__(self, machine, true):
+        self.machine, self.true, self.base = machine, true, None
+
+    def judge(self, guess, same=False, reopened=False):
+        found = [guess.machine(self.machine, run).axes["slide"].cylinder.friction.viscous for run in self.true]
+        errors = 0.1 * (np.array(found) - list(self.true.values()))  # known to 10 N s/m
+        tracks: Any = (_Uncoloured(),)
+        return Judged(guess, tracks, float(errors @ errors) + guess.prior)
+
+    def settle(self, judged, target):
+        self.base = judged
+        size = len(judged.guess.deviation)
+        return judged, Fit(judged.guess, judged.loss, 0.0, 0.0, np.eye(size))
+
+    def select_priors(self, guess):
+        return guess
+
+    def compact(self, judged):
+        return judged
+
+    def set_base(self, judged):
+        self.base = judged
+        return judged
+
+
+class _Uncoloured:
+    """A track without coloured noise."""
+
+    levels = type("Levels", (), {"colours": ()})()
+
+
+@pytest.mark.parametrize(("factors", "names"), [
+    ((1.4, 1.4, 1.4), ["viscous_friction"]),  # one wrong value
+    ((1.9, 2.5, 2.2), [BETWEEN_RUNS, "viscous_friction"]),
+    ((1.4, 0.6, 1.0), [BETWEEN_RUNS]),
+])  # fmt: skip
+def test_a_parameter_that_is_wrong_in_all_runs_becomes_an_effect(factors, names):
+    rig = load_machine("rig")
+    nominal = rig.axes["slide"].cylinder.friction.viscous
+    true = {f"run_{k}": nominal * factor for k, factor in enumerate(factors)}
+    effect = next(h for h in hypotheses(rig) if h.key == ("viscous_friction", "slide"))
+    quantity = list_quantities(rig, [effect])["viscous_friction.slide.viscous"]
+    group = between_runs(quantity, [*true, "held_out"], 1.0)
+    sizes = np.array([*true.values(), nominal]) - nominal
+    guess = Guess(((group, sizes / group.parameters["run_0"].prior_std),))
+    model: Any = _ValuePerRun(rig, true)
+    found = compare_common_values(model, Model(model.judge(guess)), [effect])
+    assert [h.name for h in found.guess.hypotheses] == names
+    assert model.base is found.judged or names == [BETWEEN_RUNS]
+    for run, value in true.items():
+        assert found.guess.machine(rig, run).axes["slide"].cylinder.friction.viscous == pytest.approx(value)
+
+
 def _set_ripple(machine, location, values):
     formula = {f"cos(position, {values['length']!r})": values["force"]}
     term = Term(name="ripple", axis=location, balance="force", law="formula", parameters=formula)
@@ -96,7 +154,7 @@ def test_a_custom_effect_is_found_whatever_its_start_value(monkeypatch):
     truth = _set_ripple(rig, "slide", {"force": 150.0, "length": 0.1})
     noise = {"position": 2e-5, "pressure_head": 1e4, "pressure_rod": 1e4}
     data = simulate_data(truth, channels, noise, model=rig, period=0.005, rows=1000, noise_stated=True)
-    gap = find_gap(data, effects=("ripple", "coulomb_friction"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("ripple", "coulomb_friction"), jobs=1)
     (found,) = gap.effects
     assert found.name == "ripple"
     assert found.parameters["length"].low < 0.1 < found.parameters["length"].high
@@ -135,7 +193,7 @@ def _rig_with_dead_band(rows):
 
 def test_a_dead_band_of_the_rig_is_found_with_its_size():
     data, true = _rig_with_dead_band(800)
-    gap = find_gap(data, effects=("valve_deadband", "command_delay", "payload"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("valve_deadband", "command_delay", "payload"), jobs=1)
     assert gap.verdict == "named"
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
     found = gap.effects[0].parameters["deadband"]
@@ -149,7 +207,7 @@ def test_a_dead_band_of_the_rig_is_found_with_its_size():
 
 @pytest.mark.nightly
 def test_a_dead_band_is_found_with_its_size(short_logs):
-    gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2, method="regression")
+    gap = find_gap(short_logs, effects=("valve_deadband", "command_delay", "payload"), jobs=2)
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "stick")]
     # truth 0.085; a dead band is known to 0.001 even from half of the logs
     assert gap.effects[0].parameters["deadband"].value == pytest.approx(0.085, abs=0.003)
@@ -166,7 +224,7 @@ def test_a_machine_with_coloured_sensor_noise_has_no_gap():
     colours = {name: Colour(c, float(data.noise[c]), 0.04, 60.0) for c, name in enumerate(channels)}
     data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
     effects = ("coulomb_friction", "valve_deadband", "internal_leakage", "spool_lag", "pressure_lag")
-    gap = find_gap(data, effects=effects, jobs=1, method="regression")
+    gap = find_gap(data, effects=effects, jobs=1)
     assert gap.verdict == "no_gap"
     assert not gap.effects
     notes = [note for note in gap.notes if "resonance" in note]
@@ -182,7 +240,7 @@ def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, freq
     data, true = _rig_with_dead_band(1600)
     colours = {name: Colour(c, float(data.noise[c]), memory, frequency) for c, name in enumerate(data.channels)}
     data = add_coloured_noise(dataclasses.replace(data, noise=np.sqrt(2.0) * data.noise), colours, seed=7)
-    gap = find_gap(data, effects=("valve_deadband", "coulomb_friction", "command_delay"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("valve_deadband", "coulomb_friction", "command_delay"), jobs=1)
     assert gap.verdict == "named"
     assert [(e.name, e.location) for e in gap.effects] == [("valve_deadband", "slide")]
     found = gap.effects[0].parameters["deadband"]
@@ -196,7 +254,7 @@ def test_an_effect_and_coloured_noise_of_all_sensors_are_both_found(memory, freq
 def test_friction_of_a_scored_bore_is_coulomb_friction_that_varies_with_position():
     """The hidden friction of open_02 acts within 0.05 m of 0.72 m of the stick's stroke."""
     data = select_exciting_segments(load_dataset([MEASURED / "open_02"], load_machine("cat215")), 45.0)
-    gap = find_gap(data, effects=("coulomb_friction",), jobs=2, method="regression")
+    gap = find_gap(data, effects=("coulomb_friction",), jobs=2)
     assert gap.verdict == "named"
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("coulomb_friction_by_position", "stick")

@@ -12,7 +12,13 @@ from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.regression import NormalEquations, compare_groups, split_columns
 from hydrotele.gap.result import gap_document
-from hydrotele.gap.run_differences import between_runs, list_quantities, rescale_between_runs
+from hydrotele.gap.run_differences import (
+    between_runs,
+    common_value,
+    has_common_value,
+    list_quantities,
+    rescale_between_runs,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.gap_report import write_report
 from hydrotele.terms.term import Term
@@ -75,13 +81,40 @@ def test_a_machine_differs_only_in_the_run_of_the_parameter():
     assert guess.parameter_runs == [("a",), ("b",)]
 
 
+@pytest.mark.parametrize(("values", "common"), [
+    ([1.3, 1.3, 1.3], True),
+    ([1.0, 1.3, 1.1], True),
+    ([1.3, -1.2, 0.1], False),
+    ([2.0, 0.1], False),  # two values: 95 % of Student's distribution are within 12.7 standard errors
+    ([1.3], False),  # one run says nothing about the scatter
+])  # fmt: skip
+def test_values_have_a_common_one_if_their_mean_is_significantly_nonzero(values, common):
+    assert has_common_value(np.array(values)) is common
+
+
+def test_values_of_runs_are_split_into_their_mean_and_the_differences_from_it():
+    """The machine of every run stays the same."""
+    rig, key = load_machine("rig"), ("viscous_friction", "slide")
+    effect = next(h for h in hypotheses(rig) if h.key == key)
+    group = between_runs(list_quantities(rig, [effect])[_VISCOUS], ["a", "b", "held_out"], 0.5)
+    deviation, size = np.array([1.0, 2.0, 0.3]), group.parameters["a"].prior_std
+    (own, start), (differing, moved) = common_value(effect, group, deviation)
+    assert own is effect and differing is group
+    assert effect.values(start)["viscous"] == pytest.approx(effect.parameters["viscous"].nominal + 1.5 * size)
+    assert moved == pytest.approx([-0.5, 0.5, 0.3])
+    before, after = Guess(((group, deviation),)), Guess(((own, start), (differing, moved)))
+    for run in ("a", "b"):
+        viscous = [g.machine(rig, run).axes["slide"].cylinder.friction.viscous for g in (before, after)]
+        assert viscous[1] == pytest.approx(viscous[0])
+
+
 def test_friction_that_differs_between_runs_is_found_and_transfers_to_another_run():
     """Viscous friction of the oil differs by up to 35 % from day to day; the held-out day is estimated, too."""
     rig = load_machine("rig")
     viscous = rig.axes["slide"].cylinder.friction.viscous
     ratios = {"run_0": 1.35, "run_1": 0.7, "run_2": 1.05, "run_3": 1.3}
     own = [rig.replace("axes.slide.cylinder.friction.viscous", viscous * k) for k in ratios.values()]
-    gap = find_gap(_simulate(own, 350), effects=("viscous_friction",), jobs=1, method="regression")
+    gap = find_gap(_simulate(own, 350), effects=("viscous_friction",), jobs=1)
     assert gap.verdict == "no_gap"
     (difference,) = gap.differences
     assert difference.name == _VISCOUS
@@ -100,7 +133,7 @@ def test_an_effect_that_the_fitted_run_does_not_show_is_named_from_the_held_out_
     rough = rig.replace("axes.slide.cylinder.friction.viscous", 1.5 * rig.axes["slide"].cylinder.friction.viscous)
     data = _simulate([rough, rough])
     data = dataclasses.replace(data, fit=(data.fit[0].select_rows(0, 30),))  # 0.15 s
-    gap = find_gap(data, effects=("viscous_friction",), jobs=1, method="regression")
+    gap = find_gap(data, effects=("viscous_friction",), jobs=1)
     assert [(e.name, e.location) for e in gap.effects] == [("viscous_friction", "slide")]
     assert any("run_1 is held out in place of run_0" in note for note in gap.notes)
 
@@ -112,7 +145,7 @@ def test_a_pulse_in_one_run_is_named_and_one_in_the_held_out_run_is_reported(tmp
         for size, start in ((300.0, 1.2), (250.0, 0.8))
     ]
     data = _simulate([pulsed[0], rig, pulsed[1]])
-    gap = find_gap(data, effects=("viscous_friction", "force_pulse"), jobs=1, method="regression")
+    gap = find_gap(data, effects=("viscous_friction", "force_pulse"), jobs=1)
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("force_pulse", "slide.run_2")
     for key, value in (("size", 250.0), ("start", 0.8), ("duration", 0.6)):
@@ -135,7 +168,7 @@ def test_a_periodic_force_has_a_phase_of_its_own_in_every_run():
         waves = {"cos(time, 0.37)": 100.0 * math.cos(phase), "sin(time, 0.37)": 100.0 * math.sin(phase)}
         term = Term(name="wave", axis="slide", balance="force", law="formula", parameters=waves)
         own.append(rig.model_copy(update={"terms": (term,)}))
-    gap = find_gap(_simulate(own, 800), effects=("force_pulse", "viscous_friction"), jobs=1, method="regression")
+    gap = find_gap(_simulate(own, 800), effects=("force_pulse", "viscous_friction"), jobs=1)
     assert gap.verdict == "named"
     (effect,) = gap.effects
     assert (effect.name, effect.location) == ("periodic_force", "slide")

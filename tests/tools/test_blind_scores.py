@@ -27,6 +27,7 @@ def result(verdict, *effects, trial="0000", before=2.0, after=1.0):
     return {"trial": trial, "answer": answer, "error": None}
 
 
+F = "coulomb_friction", "boom"
 A, B, C = ("payload", "tool"), ("valve_gain", "boom"), ("valve_gain", "stick")
 
 
@@ -52,6 +53,10 @@ A, B, C = ("payload", "tool"), ("valve_gain", "boom"), ("valve_gain", "stick")
         (key("outside", ("pump_sag", "supply")), result("unknown", effect(*A, 0.8)), False),
         (key("outside", ("pump_sag", "supply")), result("unknown", effect(*A, 0.3)), True),
         (key("outside", ("pump_sag", "supply")), result("named", effect(*A, 0.8)), False),
+        (key("outside", ("pump_sag", "supply")), result("learned"), True),
+        (key("outside", ("pump_sag", "supply")), result("no_gap"), False),
+        (key("single", F), result("named", effect("coulomb_friction_by_position", "boom")), True),
+        (key("single", F), result("named", effect("coulomb_friction_by_position", "stick")), False),
         (key("single", A), {"trial": "0", "answer": None, "error": "crashed"}, False),
     ],
 )

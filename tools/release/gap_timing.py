@@ -47,7 +47,7 @@ class Timing(NamedTuple):
     stages: dict[str, tuple[float, float]]
 
 
-def time_search(folder: Path, jobs: int) -> Timing:
+def time_case(folder: Path, jobs: int) -> Timing:
     """Search a case and measure time and memory of this process."""
     data = load_dataset([folder], load_machine("cat215"))
     find_gap(select_exciting_segments(data, _WARM_UP), effects=["internal_leakage"], jobs=jobs)
@@ -71,14 +71,14 @@ def time_search(folder: Path, jobs: int) -> Timing:
     return Timing(gap.verdict, end[0] - begin[0], end[1] - begin[1], memory, rows, sizes, stages)
 
 
-def print_timings(folder: Path, cases: Sequence[str], jobs: int) -> None:
-    """Search cases and print the tables."""
+def print_tables(folder: Path, cases: Sequence[str], jobs: int) -> None:
+    """Search the cases and print the tables."""
     print("| case | verdict | elapsed [s] | processor time [s] | peak memory [GB] | errors x columns |")
     print("| --- | --- | --- | --- | --- | --- |")
     found = []
     for case in cases:
         with multiprocessing.get_context("spawn").Pool(1) as pool:
-            t = pool.apply(time_search, (folder / case, jobs))
+            t = pool.apply(time_case, (folder / case, jobs))
         found.append(t)
         print(
             f"| {case} | {t.verdict} | {t.elapsed:.0f} | {t.processor:.0f} | {t.memory:.1f} |"
@@ -95,4 +95,4 @@ if __name__ == "__main__":
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--cases", nargs="+", default=["open_08", "open_01", "open_04", "open_07", "open_10"])
     args = parser.parse_args()
-    print_timings(args.folder, args.cases, args.jobs)
+    print_tables(args.folder, args.cases, args.jobs)

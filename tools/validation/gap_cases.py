@@ -25,14 +25,14 @@ import yaml
 from scipy.stats import binomtest
 
 from hydrotele.core.errors import InputError
-from hydrotele.gap.answer import base_effect
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import LIKELY, gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.machine.machine_file import load_machine
+from tools.validation.blind.judge import is_among
 from tools.validation.blind.trials import Place, write_json
 from tools.validation.blind.world_trials import load_world_series
-from tools.validation.open_cases import expected
+from tools.validation.open_cases import expected, right_names
 
 _NAMING = ("named", "partly", "ambiguous")
 
@@ -60,7 +60,7 @@ def list_open_cases(folder: Path) -> Iterator[Case]:
     """Yield the public benchmark cases."""
     for name, answer in yaml.safe_load((folder / "answers.yaml").read_text()).items():
         verdict, effects = expected(answer)
-        hidden = tuple(((effect, place),) for effect, place, _, _ in effects)
+        hidden = tuple(tuple((one, place) for one in right_names(effect)) for effect, place, _, _ in effects)
         yield Case(name, folder / name, "cat215", hidden, verdict != "unknown")
 
 
@@ -99,11 +99,11 @@ def judge_case(case: Case, document: dict[str, Any]) -> dict[str, Any]:
         unchanged machine or an unmodelled effect: whether nothing is named); `false`: number of wrong ones.
     """
     naming = document["effects"] if document["verdict"] in _NAMING else []
-    named = [(base_effect(e["name"]), e["location"]) for e in naming if e["probability"] > LIKELY]
+    named = [(e["name"], e["location"]) for e in naming if e["probability"] > LIKELY]
     right = {pair for pairs in case.hidden for pair in pairs}
-    false = sum(pair not in right for pair in named)
+    false = sum(not is_among(*pair, right) for pair in named)
     if case.is_known and case.hidden:
-        found = all(any(pair in pairs for pair in named) for pairs in case.hidden)
+        found = all(any(is_among(*pair, pairs) for pair in named) for pairs in case.hidden)
     else:
         found = not named
     return {"named": named, "found": found, "false": false}

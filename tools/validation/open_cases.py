@@ -31,10 +31,20 @@ NAMES = {
 }
 _SCORED = "position-dependent friction (scored bore zone)"
 # which the answers, older than the effect, call out of the library
+_VARYING = {"position_dependent_friction": "coulomb_friction_by_position"}
 PLACES = {
     "all axes": "all", "stick valve": "stick", "boom head side": "boom.head",
     "boom cylinder (A to B)": "boom", "stick angle": "stick", "stick cylinder": "stick",
 }  # fmt: skip
+
+
+def right_names(effect: str) -> tuple[str, ...]:
+    """Return the names that are right for an effect: its own, and that of the same law as a varying coefficient.
+
+    >>> right_names("position_dependent_friction")
+    ('position_dependent_friction', 'coulomb_friction_by_position')
+    """
+    return (effect, _VARYING[effect]) if effect in _VARYING else (effect,)
 
 
 def _name(described: str) -> str:
@@ -63,10 +73,11 @@ def expected(answer: dict) -> tuple[str, list[tuple[str, str, float, float]]]:
 def right(gap: Gap, answer: dict) -> bool:
     """Whether verdict, names and locations are those of the answer."""
     verdict, effects = expected(answer)
+    if verdict == "unknown":
+        return gap.verdict == verdict
     found = {(e.name, e.location) for e in gap.effects}
-    return gap.verdict == verdict and (
-        verdict == "unknown" or found == {(name, place) for name, place, _, _ in effects}
-    )
+    rest = [{(other, place) for other in right_names(name)} for name, place, _, _ in effects]
+    return gap.verdict == verdict and len(found) == len(rest) and all(found & pairs for pairs in rest)
 
 
 def described(gap: Gap) -> str:

@@ -1,8 +1,10 @@
 """Judge one answer: pure functions of a key and a `gap.json` document."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
+
+from hydrotele.gap.answer import base_effect
 
 DETECTABLE = 10.0
 """Least visibility (root of the summed squares over all samples and channels of the fit runs) at
@@ -53,6 +55,15 @@ class Verdict:
     error: str | None = None
 
 
+def is_among(name: str, location: str, pairs: Collection[tuple[str, str]]) -> bool:
+    """Return whether a named effect, or the one whose varying coefficient it is, is among (name, location) pairs.
+
+    >>> is_among("coulomb_friction_by_position", "stick", [("coulomb_friction", "stick")])
+    True
+    """
+    return (name, location) in pairs or (base_effect(name), location) in pairs
+
+
 def judge(key: Document, result: Document) -> Verdict:
     """Compare the key of a trial with the workflow's answer.
 
@@ -64,20 +75,21 @@ def judge(key: Document, result: Document) -> Verdict:
         The verdict. Right is: for one or two effects, that exactly as many are named as were
         planted and each planted one is among them, or in the ambiguous set of one of them; for a
         clean machine, that the answer is `no_gap`; for an effect outside the library, that the
-        answer is `unknown` and nothing is named with more than 50 %, or that a force pulse is named as such.
+        answer is `unknown` or `learned` and nothing is named with more than 50 %, or that a force pulse is named as
+        such.
     """
     planted = {_label(e): e for e in key["effects"]}
     sizes = [e["visibility"]["total_fit_runs"] for e in key["effects"]]
     visible = min(sizes, default=None)
     answer = result["answer"] or {}
-    named = answer.get("effects", [])
+    named = [_with_base(e, planted) for e in answer.get("effects", [])]
     verdict = answer.get("verdict", "failed")
     found = _found(planted, named, verdict == "ambiguous")
     match key["class"]:
         case "clean":
             right = verdict == "no_gap" and not named
         case "outside":
-            right = verdict == "unknown" and all(e["probability"] <= SURE for e in named)
+            right = verdict in ("unknown", "learned") and all(e["probability"] <= SURE for e in named)
             right |= _is_pulse(key["effects"], named)
         case _:
             right = verdict in ("named", "ambiguous") and len(named) == len(planted) == len(found)
@@ -95,10 +107,16 @@ def judge(key: Document, result: Document) -> Verdict:
 
 
 def _is_pulse(planted: list[Document], named: list[Document]) -> bool:
-    """Return whether a planted force pulse is named, in each run apart; only the regression has it in its library."""
+    """Return whether a planted force pulse is named, in each run apart."""
     places = {e["location"].rpartition(".")[0] for e in named if e["name"] == "force_pulse"}
     is_alone = all(e["name"] == "force_pulse" for e in named)
     return is_alone and places == {e["location"] for e in planted if e["name"] == "pulse"} and bool(places)
+
+
+def _with_base(effect: Document, planted: Mapping[str, Any]) -> Document:
+    """Return a named effect whose coefficient varies under the name of the effect, if that is planted there."""
+    base = {**effect, "name": base_effect(effect["name"])}
+    return base if _label(base) in planted else effect
 
 
 def _label(effect: Document) -> str:

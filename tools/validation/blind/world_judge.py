@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy as np
 
+from tools.validation.blind.judge import is_among
 from tools.validation.blind.score import share
 
 Document = Mapping[str, Any]
@@ -107,10 +108,10 @@ def judge_world(key: Document, result: Document) -> Outcome:
     likely = [(e["name"], e["location"]) for e in naming if e["probability"] > LIKELY]
     lists = [[tuple(pair) for pair in part["right"]] for part in key["planted"]]
     everything = {pair for pairs in lists for pair in pairs}
-    found = tuple(any(pair in pairs for pair in likely) for pairs in lists)
+    found = tuple(any(is_among(*pair, pairs) for pair in likely) for pairs in lists)
     surest = max(naming, key=lambda e: e["probability"], default=None)
-    led = surest is not None and (surest["name"], surest["location"]) in everything
-    false = sum(pair not in everything for pair in likely)
+    led = surest is not None and is_among(surest["name"], surest["location"], everything)
+    false = sum(not is_among(*pair, everything) for pair in likely)
     top = max((e["probability"] for e in effects), default=0.0)
     if key["kind"] == "outside":
         right = verdict != "failed" and top <= LIKELY
