@@ -13,7 +13,7 @@ from hydrotele.estimate.filter import Gains
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration
 from hydrotele.estimate.levels import linear_filter, linear_run, propose_colours
 from hydrotele.estimate.track import COARSE, Levels, Track, first_rows, row_variances, state_drift, track_run
-from hydrotele.gap.backlash import add_backlash, is_unexplained
+from hydrotele.gap.backlash import BACKLASH, add_backlash, is_unexplained
 from hydrotele.gap.calibrating import fit_until_settled
 from hydrotele.gap.dictionary import Dictionary, Version, build_dictionary
 from hydrotele.gap.disturbances import compare_disturbances, is_pulse, list_disturbances
@@ -160,8 +160,13 @@ class MachineModel(GapModel):
                 best[starts[index][0].key] = after, index
         chosen = [starts[index] for _, index in sorted(best.values())[:_STARTED]]
         evidence.set_base(judged)
-        found = [evidence.judged(judged.guess.plus(*start), reopened=True) for start in chosen]
-        return [one for one in found if np.isfinite(one.loss)]
+        found = [
+            add_backlash(evidence, judged.guess, h.location)
+            if h.name == BACKLASH
+            else evidence.judged(judged.guess.plus(h, start), reopened=True)
+            for h, start in chosen
+        ]
+        return [one for one in found if one and np.isfinite(one.loss)]
 
     def search_backlash(
         self, judged: Judged, effect: Hypothesis, tell: Callable[[str, float], None]

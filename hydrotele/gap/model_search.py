@@ -231,7 +231,7 @@ def add_effects(
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
         if not index:
-            others += search_directly(model, now, model.try_start_values(now.judged, candidates))
+            others += search_directly(model, now, model.try_start_values(now.judged, [*candidates, *direct]))
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
             now = renew_noise(model, now, better)
