@@ -52,7 +52,7 @@ PARAMETER_SCALES = (0.0, 0.1, 0.3, 1.0, 3.0)
 _JOINT = 40  # best effects among which a pair is looked for
 _LAWS_AT_ONCE = 30  # in memory: 500 columns
 _COMPONENTS = 4  # of the sum of single effects
-_TRIED = 8  # candidates that are refined in each round, each of another family
+_TRIED = 4  # candidates that are refined in each round, and as many of other families
 _RIVALS = 3  # candidates that are refined in the place of an accepted effect
 _CLOSE = 100.0  # twice the log Bayes factor; a rival that stays farther behind is not fitted to the end
 _KEPT = 50  # effects that are linearised again after the first round
@@ -230,7 +230,7 @@ def add_effects(
         tell("refine the best effects", share + 0.03)
         models = extensions(model, now, proposals)
         others = [*colour_noise(model, now), *extensions(model, now, varying[:1])]
-        if not index:
+        if not index and all(is_incomplete(m) for m in models):
             others += search_directly(model, now, model.try_start_values(now.judged, [*candidates, *direct]))
         better = min((*models, *others), key=lambda m: m.charged_score, default=now)
         if better.charged_score < now.charged_score:
@@ -279,6 +279,11 @@ def compare_common_values(model: GapModel, now: Model, candidates: Sequence[Hypo
         now = min(found, key=lambda m: m.charged_score, default=now)
         now = replace(now, judged=model.set_base(now.judged))
     return now
+
+
+def is_incomplete(one: Model) -> bool:
+    """Return whether a model has residual inputs."""
+    return bool(one.judged.tracks[0].levels.inputs)
 
 
 def search_directly(model: GapModel, now: Model, found: Sequence[Judged]) -> list[Model]:
@@ -517,13 +522,14 @@ def _keep(best: dict[tuple[str, str], Proposal], proposal: Proposal) -> bool:
 def extensions(model: GapModel, now: Model, proposals: Sequence[Proposal]) -> list[Model]:
     """Refine the best proposals that the linear step holds for better than the model; all but the best are compact."""
     better = [p for p in proposals if p.factor > MIN_LOG_BAYES_FACTOR]
-    # the linear step may rank one family far too low: residual inputs hide what a late sensor reads
-    families = {p.families: p for p in reversed(better) if not p.law}
-    chosen = sorted(families.values(), key=lambda p: -p.factor)[:_TRIED]
-    laws = {p.law.kind: p for p in reversed(better) if p.law}
-    chosen += laws.values()
+    effects, laws = [p for p in better if not p.law], {p.law.kind: p for p in reversed(better) if p.law}
+    # the linear step may rank a family far too low; its best effect is refined where the others do not explain all
+    rest = effects[_TRIED:]
+    further = sorted({p.families: p for p in reversed(rest)}.values(), key=lambda p: -p.factor)[:_TRIED]
     found: list[Model] = []
-    for proposal in chosen:
+    for index, proposal in enumerate((*effects[:_TRIED], *laws.values(), *further)):
+        if index >= _TRIED + len(laws) and not all(map(is_incomplete, found)):
+            break
         if (refined := refine(model, now, proposal)) is not None:
             best = min((*found, refined), key=lambda m: m.charged_score)
             found = [m if m is best else compact(model, m) for m in (*found, refined)]
