@@ -1,16 +1,12 @@
-"""Numbers that only free runs tell, calibrated before the search for effects.
+"""Calibration by open-loop predictions before the search, and fits whose noise levels are re-estimated.
 
-A machine file that is an estimate says so: `uncertainty: {flow_table: 1.0, linkage: 0.15}`. What a
-valve lets through at which command then weighs more than any effect of the library, and where no
-pressure is read, one-step predictions hardly feel it. So these numbers are fitted to free runs
-first, and an effect is what remains after that. The fit is kept only if it predicts stretches of
-the fit runs better that are left out of it one by one.
+A machine file may state that its numbers are estimates: `uncertainty: {flow_table: 1.0, linkage: 0.15}`. Where no
+pressure is logged, one-step predictions hardly depend on the flow of a valve over its command. Such parameters are
+therefore fitted to open-loop predictions first, and the search explains what remains. The fit is kept only if
+cross-validation over parts of the fitted runs has smaller errors.
 
-A drive with a pump of its own is told by free runs, too, pressures or not: what its motor, its oil
-and its friction do lasts longer than a reading, and where a pump stalls or a piston sticks, one-
-step predictions say nothing. All numbers that its machine file calls uncertain are fitted then.
-
-Fits whose noise levels follow: an effect's numbers and what a model lacks, found in turn.
+The same is done for a drive with a pump of its own, with or without pressures: the motor, the oil and the friction act
+for longer than one reading. All parameters that its machine file states as uncertain are fitted then.
 """
 
 from collections.abc import Callable

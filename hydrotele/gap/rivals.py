@@ -1,7 +1,4 @@
-"""What else could stand in the place of an effect, and how likely each of them is.
-
-What of a guess is needed: each effect against the guess without it.
-"""
+"""The result of a search, the rivals of its effects, and the probabilities of both."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
