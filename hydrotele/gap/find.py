@@ -27,7 +27,7 @@ from hydrotele.gap.explanation import compare_contenders, list_rejections, trace
 from hydrotele.gap.heldout import compare_heldout
 from hydrotele.gap.initial_regressions import run_initial_regressions, with_start_values
 from hydrotele.gap.interim import Interim, keep_better
-from hydrotele.gap.laws import learned_of, with_profile
+from hydrotele.gap.laws import LawHypothesis, learned_of, with_profile
 from hydrotele.gap.machine_model import MachineModel
 from hydrotele.gap.model_search import search_model
 from hydrotele.gap.posterior import Posterior, sample_posterior
@@ -244,7 +244,8 @@ def find_gap(
         ranking=tuple(
             Candidate(
                 s.hypothesis.name, s.hypothesis.location, s.factor,
-                s.hypothesis.values(s.deviation), {key: p.unit for key, p in s.hypothesis.parameters.items()},
+                {} if isinstance(s.hypothesis, LawHypothesis) else s.hypothesis.values(s.deviation),
+                {key: p.unit for key, p in s.hypothesis.parameters.items()},
             )
             for s in found.ranking[:15]
         ),

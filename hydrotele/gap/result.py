@@ -211,7 +211,7 @@ class Candidate:
 
     Attributes:
         log_bayes_factor: twice the log Bayes factor against the given model, by the linear step.
-        parameters: parameter -> value.
+        parameters: parameter -> value; empty for a law or a profile, whose coefficients alone say nothing.
         units: parameter -> its SI unit, where the library does not state it.
     """
 
